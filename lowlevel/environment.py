@@ -1,0 +1,417 @@
+"""The low-level environment: N robots that track whole-body commands. Read :meth:`PilotEnvironment.step` first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import torch
+from torch import Tensor
+
+from lowlevel.commands import (
+    HEIGHT,
+    POSTURE,
+    TORSO,
+    VELOCITY,
+    CommandMixture,
+    CommandRange,
+    CommandSampler,
+    command_space,
+)
+from lowlevel.measures import Measurement, has_fallen, height_error, measure, torso_error
+from lowlevel.nominal import NominalConfig, NominalMotion, NominalState
+from lowlevel.observation import (
+    FRAME_SIZE,
+    HISTORY_LENGTH,
+    PRIVILEGED_SIZE,
+    FrameBuilder,
+    NoiseConfig,
+    map_observation,
+    push_history,
+    start_history,
+)
+from lowlevel.randomization import RandomizationConfig, Randomizer
+from lowlevel.rewards import RewardWeights, Transition, compute_rewards
+from lowlevel.rotations import conjugate, from_roll_pitch_yaw, multiply, rotate_about_vertical
+from lowlevel.simulation import BatchSimulation
+from lowlevel.terrain import MAP_SIZE, Terrain, TerrainConfig
+from robots.g1.constants import GAINS, LOWER_JOINTS, NUM_JOINTS, WAIST_JOINTS
+from robots.g1.model import ModelOptions, build_spec
+
+MAP_REFRESH_STEPS = 5
+"""Control steps between refreshes of the elevation map: 10 Hz at 50 Hz control (paper IV-B)."""
+
+
+@dataclass(frozen=True)
+class EnvironmentConfig:
+    """Everything about the low-level task except learning."""
+
+    num_robots: int = 512
+    """Robots simulated side by side."""
+    num_threads: int = 2
+    """Physics threads."""
+    timestep: float = 0.02 / 3
+    """Physics step [s]."""
+    decimation: int = 3
+    """Physics steps per control step; timestep * decimation must be 0.02 s (50 Hz)."""
+    gains: str = "stiff"
+    """PD gain set, a key of robots.g1.constants.GAINS."""
+    episode_length: float = 20.0
+    """Longest episode [s]."""
+    command_interval: tuple[float, float] = (4.0, 8.0)
+    """Time between new commands, uniform [s]."""
+    start_in_posture: float = 0.5
+    """Share of episodes that start in the commanded posture instead of standing upright."""
+    action_limit: float = 8.0
+    """Actions are clipped to +- this many action scales."""
+    nominal: NominalConfig = field(default_factory=NominalConfig)
+    mixture: CommandMixture = field(default_factory=CommandMixture)
+    terrain: TerrainConfig = field(default_factory=TerrainConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    rewards: RewardWeights = field(default_factory=RewardWeights)
+
+
+@dataclass
+class Buffers:
+    """Per-robot tensors that live across steps; with the simulation's state they are the whole environment."""
+
+    command: Tensor
+    flag: Tensor
+    command_countdown: Tensor
+    episode_step: Tensor
+    action: Tensor
+    previous_action: Tensor
+    previous_target: Tensor
+    reference: Tensor
+    phase: Tensor
+    walking: Tensor
+    history: Tensor
+    elevation: Tensor
+    foot_air_time: Tensor
+    foot_contact_time: Tensor
+    hand_force: Tensor
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one step returns; tensors have one row per robot."""
+
+    observation: dict[str, Tensor]
+    """After resets: "history", "elevation_map", "flag", "privileged"."""
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    next_privileged: Tensor
+    """Privileged observation before resets: the true successor state."""
+    terms: dict[str, Tensor]
+    """Unweighted reward terms."""
+    measured: Measurement
+    """Before resets."""
+    command: Tensor
+    """The clamped command that the step tracked (N, 21)."""
+
+
+class PilotEnvironment:
+    """Batched environment with auto-reset.
+
+    Args:
+        config: the task.
+        seed: seed of commands, noise, randomisation and resets.
+        device: where tensors live.
+    """
+
+    def __init__(self, config: EnvironmentConfig, seed: int = 0, device: torch.device | str = "cpu") -> None:
+        if abs(config.timestep * config.decimation - 0.02) > 1e-9:
+            raise ValueError(
+                f"timestep {config.timestep} s times decimation {config.decimation} is not the control period 0.02 s"
+            )
+        self.config = config
+        self.device = torch.device(device)
+        self.generator = torch.Generator(device=self.device).manual_seed(seed)
+        self.terrain = Terrain(config.terrain, device)
+        spec = build_spec(ModelOptions(gains=config.gains, timestep=config.timestep))
+        self.terrain.add_to(spec)
+        self.simulation = BatchSimulation(
+            spec.compile(), config.num_robots, config.decimation, config.num_threads, device
+        )
+        self.control_period = self.simulation.control_period
+        self.max_steps = round(config.episode_length / self.control_period)
+        lower, upper = self.simulation.joint_lower, self.simulation.joint_upper
+        self.command_space = command_space(lower.tolist(), upper.tolist())
+        self.sampler = CommandSampler(self.command_space, config.mixture, device)
+        gains = GAINS[config.gains]
+        self.motion = NominalMotion(config.nominal, gains, lower, upper, self.control_period, device)
+        self.action_scale = torch.tensor(gains.action_scale, dtype=torch.float32, device=device)
+        self.build_frame = FrameBuilder(self.command_space, self.motion, device)
+        self.randomizer = Randomizer(config.randomization, self.simulation, self.generator)
+        self.open_range = CommandRange()
+        self._noise = config.noise.frame_amplitude().to(device)
+        self._step_count = 0
+        self.buffers = self._empty_buffers(config.num_robots)
+
+    @property
+    def num_robots(self) -> int:
+        return self.config.num_robots
+
+    def _empty_buffers(self, n: int) -> Buffers:
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(n, *shape, device=self.device)
+
+        neutral = self.command_space.neutral(self.device).repeat(n, 1)
+        return Buffers(
+            command=neutral,
+            flag=zeros(1),
+            command_countdown=zeros(),
+            episode_step=torch.zeros(n, dtype=torch.long, device=self.device),
+            action=zeros(NUM_JOINTS),
+            previous_action=zeros(NUM_JOINTS),
+            previous_target=zeros(NUM_JOINTS),
+            reference=neutral.clone(),
+            phase=zeros(),
+            walking=zeros(),
+            history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
+            elevation=zeros(MAP_SIZE),
+            foot_air_time=zeros(2),
+            foot_contact_time=zeros(2),
+            hand_force=zeros(2, 3),
+        )
+
+    def _uniform(self, low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=self.generator, device=self.device)
+
+    # -- stepping ---------------------------------------------------------------------------------------------
+
+    def reset(self, spread_episodes: bool = False) -> dict[str, Tensor]:
+        """Reset all robots; with ``spread_episodes`` time limits are spread so that they do not coincide."""
+        everyone = torch.arange(self.num_robots, device=self.device)
+        self._reset_robots(everyone)
+        if spread_episodes:
+            self.buffers.episode_step = torch.randint(
+                self.max_steps, (self.num_robots,), generator=self.generator, device=self.device
+            )
+        measured = measure(self.simulation.read(), self.terrain)
+        self._observe(measured, everyone)
+        return self._observation(measured)
+
+    def step(self, action: Tensor) -> StepResult:
+        """Apply residual ``action`` (N, 29) for one control step of 0.02 s."""
+        buffers = self.buffers
+        action = action.clamp(-self.config.action_limit, self.config.action_limit)
+        nominal_target = self.motion.joint_targets(self._nominal_state())
+        target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
+        applied = torch.where(self.randomizer.state.is_delayed, buffers.previous_target, target)
+        buffers.previous_target = target
+        self.simulation.step(applied)
+
+        measured = measure(self.simulation.read(), self.terrain)
+        buffers.previous_action, buffers.action = buffers.action, action
+        buffers.episode_step += 1
+        self._update_foot_times(measured)
+        fallen = has_fallen(measured, buffers.reference) | self.simulation.diverged()
+        truncated = (buffers.episode_step >= self.max_steps) & ~fallen
+        transition = Transition(
+            measured=measured,
+            command=buffers.command,
+            flag=buffers.flag,
+            action=action,
+            previous_action=buffers.previous_action,
+            nominal_target=nominal_target,
+            phase=buffers.phase,
+            walking=buffers.walking,
+            foot_air_time=buffers.foot_air_time,
+            foot_contact_time=buffers.foot_contact_time,
+            fallen=fallen,
+        )
+        reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
+        tracked_command = buffers.command
+        next_privileged = self._privileged(measured)
+
+        done = torch.nonzero(fallen | truncated)[:, 0]
+        after = measured
+        if len(done):
+            self._reset_robots(done)
+            after = measure(self.simulation.read(), self.terrain)
+        buffers.hand_force = self.randomizer.disturb(after.robot, after.heading)
+        self._resample_due_commands()
+        self._advance_nominal()
+        self._step_count += 1
+        self._observe(after, done)
+        return StepResult(
+            observation=self._observation(after),
+            reward=reward,
+            terminated=fallen,
+            truncated=truncated,
+            next_privileged=next_privileged,
+            terms=terms,
+            measured=measured,
+            command=tracked_command,
+        )
+
+    def set_command(self, ids: Tensor, command: Tensor, flag: Tensor, hold: float = float("inf")) -> None:
+        """Give robots ``ids`` (n,) a ``command`` (n, 21), clamped here, for ``hold`` seconds."""
+        self.buffers.command = self.buffers.command.clone()
+        self.buffers.command[ids] = self.motion.clamp(command)
+        self.buffers.flag[ids] = flag
+        self.buffers.command_countdown[ids] = hold
+
+    # -- parts of a step --------------------------------------------------------------------------------------
+
+    def _nominal_state(self) -> NominalState:
+        return NominalState(self.buffers.reference, self.buffers.phase, self.buffers.walking)
+
+    def _advance_nominal(self) -> None:
+        state = self.motion.advance(self._nominal_state(), self.buffers.command)
+        self.buffers.reference, self.buffers.phase, self.buffers.walking = state.reference, state.phase, state.walking
+
+    def _update_foot_times(self, measured: Measurement) -> None:
+        contact, period = measured.foot_contact, self.control_period
+        self.buffers.foot_contact_time = torch.where(contact, self.buffers.foot_contact_time + period, 0.0)
+        self.buffers.foot_air_time = torch.where(contact, 0.0, self.buffers.foot_air_time + period)
+
+    def _resample_due_commands(self) -> None:
+        self.buffers.command_countdown -= self.control_period
+        due = torch.nonzero(self.buffers.command_countdown <= 0.0)[:, 0]
+        if len(due):
+            self._sample_commands(due)
+
+    def _sample_commands(self, ids: Tensor) -> None:
+        command, flag = self.sampler.sample(len(ids), self.open_range, self.generator)
+        self.set_command(ids, command, flag)
+        self.buffers.command_countdown[ids] = self._uniform(*self.config.command_interval, len(ids))
+
+    def _reset_robots(self, ids: Tensor) -> None:
+        """Start new episodes on random tiles, headings and commands."""
+        buffers, count = self.buffers, len(ids)
+        self._sample_commands(ids)
+        in_posture = self._uniform(0.0, 1.0, count, 1) < self.config.start_in_posture
+        neutral = self.sampler.neutral.expand(count, -1)
+        reference = torch.where(in_posture, buffers.command[ids], neutral).clone()
+        reference[:, VELOCITY] = 0.0
+        state = NominalState(reference, torch.zeros(count, device=self.device), torch.zeros(count, device=self.device))
+        buffers.reference[ids], buffers.phase[ids], buffers.walking[ids] = reference, 0.0, 0.0
+
+        heading = self._uniform(-torch.pi, torch.pi, count)
+        joint_position = self.motion.joint_targets(state)
+        if self.config.nominal.kind == "default":
+            orientation = from_roll_pitch_yaw(heading[:, None] * torch.tensor([0.0, 0.0, 1.0], device=self.device))
+            height = neutral[:, HEIGHT]
+        else:
+            joint_position[:, LOWER_JOINTS] = self.motion.pose.lookup(reference[:, POSTURE])[0]
+            orientation = self._posture_orientation(heading, reference[:, TORSO], joint_position[:, WAIST_JOINTS])
+            height = reference[:, HEIGHT]
+        joint_position += self._uniform(-0.02, 0.02, count, NUM_JOINTS)
+
+        tile = torch.randint(len(self.terrain.tile_centers), (count,), generator=self.generator, device=self.device)
+        reach = 0.5 * self.config.terrain.tile_size - 1.0
+        xy = self.terrain.tile_centers[tile] + self._uniform(-reach, reach, count, 2)
+        on_ground = torch.cat([xy, torch.zeros(count, 1, device=self.device)], -1)
+        highest_ground = -self.terrain.elevation_map(on_ground, heading).amin(dim=1)
+        base_position = torch.cat([xy, (highest_ground + height + 0.005)[:, None]], -1)
+        base_velocity = torch.zeros(count, 6, device=self.device)
+        base_velocity[:, :3] = self._uniform(-0.2, 0.2, count, 3)
+        self.simulation.reset(ids, base_position, orientation, joint_position, base_velocity)
+        self.randomizer.draw(ids, self.open_range.arms)
+        self.simulation.forward(ids)
+
+        buffers.previous_target[ids] = joint_position
+        buffers.action[ids], buffers.previous_action[ids] = 0.0, 0.0
+        buffers.foot_air_time[ids], buffers.foot_contact_time[ids] = 0.0, 0.0
+        buffers.episode_step[ids] = 0
+
+    def _posture_orientation(self, heading: Tensor, torso: Tensor, waist: Tensor) -> Tensor:
+        """Pelvis quaternion (n, 4) that puts the torso at ``torso`` (roll, pitch, yaw) with the ``waist`` joints (n, 3)."""
+        zero = torch.zeros_like(heading)
+        yaw, roll, pitch = waist.unbind(-1)
+        waist_rotation = multiply(
+            from_roll_pitch_yaw(torch.stack([zero, zero, yaw], -1)),
+            multiply(
+                from_roll_pitch_yaw(torch.stack([roll, zero, zero], -1)),
+                from_roll_pitch_yaw(torch.stack([zero, pitch, zero], -1)),
+            ),
+        )
+        facing = from_roll_pitch_yaw(torch.stack([zero, zero, heading], -1))
+        return multiply(facing, multiply(from_roll_pitch_yaw(torso), conjugate(waist_rotation)))
+
+    # -- observation ------------------------------------------------------------------------------------------
+
+    def _frame(self, measured: Measurement) -> Tensor:
+        robot, buffers = measured.robot, self.buffers
+        return self.build_frame(
+            robot.joint_position + self.randomizer.state.joint_offset,
+            robot.joint_velocity,
+            robot.base_angular_velocity,
+            measured.projected_gravity,
+            buffers.command,
+            buffers.action,
+            self._nominal_state(),
+        )
+
+    def _observe(self, measured: Measurement, new_episodes: Tensor) -> None:
+        """Push a noisy frame into the histories, restart those of new episodes, refresh the map at 10 Hz."""
+        buffers = self.buffers
+        frame = self._frame(measured)
+        frame += self._noise * self._uniform(-1.0, 1.0, *frame.shape)
+        buffers.history = push_history(buffers.history, frame)
+        if len(new_episodes):
+            buffers.history[new_episodes] = start_history(frame[new_episodes])
+        if self._step_count % MAP_REFRESH_STEPS == 0 or len(new_episodes):
+            elevation = map_observation(self.terrain.elevation_map(measured.robot.base_position, measured.heading))
+            elevation = elevation + self.config.noise.elevation * self._uniform(-1.0, 1.0, *elevation.shape)
+            if self._step_count % MAP_REFRESH_STEPS == 0:
+                buffers.elevation = elevation
+            else:
+                buffers.elevation[new_episodes] = elevation[new_episodes]
+
+    def _observation(self, measured: Measurement) -> dict[str, Tensor]:
+        return {
+            "history": self.buffers.history.flatten(1),
+            "elevation_map": self.buffers.elevation,
+            "flag": self.buffers.flag.clone(),
+            "privileged": self._privileged(measured),
+        }
+
+    def _privileged(self, measured: Measurement) -> Tensor:
+        robot, buffers = measured.robot, self.buffers
+        heading = measured.heading[:, None]
+        elevation = self.terrain.elevation_map(robot.base_position, measured.heading)
+        parts = (
+            measured.linear_velocity,
+            self._frame(measured),
+            height_error(measured, buffers.command)[:, None],
+            torso_error(measured, buffers.command),
+            measured.foot_contact.float(),
+            measured.foot_clearance,
+            rotate_about_vertical(-heading, robot.foot_position - robot.base_position[:, None]).flatten(1),
+            rotate_about_vertical(-heading, robot.foot_velocity).flatten(1),
+            rotate_about_vertical(-heading, robot.foot_force).flatten(1) / 400.0,
+            buffers.hand_force.flatten(1) / 20.0,
+            self.randomizer.state.friction,
+            self.randomizer.state.added_mass,
+            buffers.flag,
+            map_observation(elevation),
+        )
+        privileged = torch.cat(parts, dim=-1)
+        assert privileged.shape[-1] == PRIVILEGED_SIZE
+        return privileged
+
+    # -- saving -----------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, object]:
+        """Everything needed to continue bit-exactly on a CPU."""
+        return {
+            "simulation": self.simulation.state_dict(),
+            "buffers": {f.name: getattr(self.buffers, f.name) for f in fields(Buffers)},
+            "randomization": {f.name: getattr(self.randomizer.state, f.name) for f in fields(self.randomizer.state)},
+            "generator": self.generator.get_state(),
+            "step_count": self._step_count,
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore :meth:`state_dict`; raises ValueError if it belongs to another configuration."""
+        self.simulation.load_state_dict(state["simulation"])
+        for name, value in state["buffers"].items():
+            setattr(self.buffers, name, value.clone())
+        for name, value in state["randomization"].items():
+            setattr(self.randomizer.state, name, value.clone())
+        self.generator.set_state(state["generator"])
+        self._step_count = state["step_count"]

@@ -1,0 +1,145 @@
+"""What the action is a residual on: reference filter, gait clock, and nominal joint targets.
+
+The paper adds the policy's arm output to the commanded arm joints (III-B-2). Here the same is done for legs and
+waist: their nominal target comes from the nominal-pose table, and, as an addition to the paper, a feed-forward
+march lifts the swing leg in time with a gait clock. The training environment and the frozen controller share this
+module, so they cannot drift apart.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, POSTURE, TORSO, VELOCITY, is_walking
+from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, LOWER_JOINTS, NUM_JOINTS, Gains, joint_index
+from robots.g1.nominal_pose import NominalPose
+
+
+@dataclass(frozen=True)
+class NominalConfig:
+    """Nominal motion that the policy's action corrects."""
+
+    kind: Literal["default", "pose", "march"] = "march"
+    """``default``: legs and waist around the default pose; ``pose``: around the nominal-pose table;
+    ``march``: the table plus a feed-forward march while walking."""
+    gait_clock: bool = True
+    """Show the gait clock to the policy (sine and cosine, zero while standing); an addition to the paper."""
+    gait_frequency: float = 1.4
+    """Steps of one foot per second [Hz]."""
+    height_rate: float = 0.5
+    """Slew rate of the base height reference [m/s]."""
+    torso_rate: float = 1.5
+    """Slew rate of the torso attitude reference [rad/s]."""
+    arm_rate: float = 4.0
+    """Slew rate of the arm reference [rad/s]."""
+    walking_ramp: float = 0.3
+    """Time over which the march fades in and out [s]."""
+    knee_lift: float = 0.9
+    """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
+    lateral_shift: float = 0.10
+    """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
+    stride: float = 0.22
+    """Hip swing per commanded velocity [rad per m/s, rad per rad/s]."""
+
+
+@dataclass
+class NominalState:
+    """State of the reference filter and gait clock; one row per robot."""
+
+    reference: Tensor
+    """Slewed command (N, 21); its velocity part is the command itself."""
+    phase: Tensor
+    """Gait phase (N,) [rad]; the left foot swings in (0, pi), the right one in (pi, 2 pi)."""
+    walking: Tensor
+    """Fade-in of the march (N,) in [0, 1]."""
+
+
+class NominalMotion:
+    """Advances references and turns them into nominal joint targets; holds no per-robot state itself."""
+
+    def __init__(
+        self,
+        config: NominalConfig,
+        gains: Gains,
+        joint_lower: Tensor,
+        joint_upper: Tensor,
+        control_period: float,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.config = config
+        self.control_period = control_period
+        self.pose = NominalPose.load(device)
+        self.lower, self.upper = joint_lower.to(device), joint_upper.to(device)
+        self.default = torch.tensor(DEFAULT_POSITION, dtype=torch.float32, device=device)
+        stiffness = torch.tensor(gains.stiffness[LOWER_JOINTS], dtype=torch.float32, device=device)
+        self._inverse_stiffness = 1.0 / stiffness
+        rate = torch.full((COMMAND_SIZE,), math.inf, device=device)
+        rate[HEIGHT], rate[TORSO], rate[ARMS] = config.height_rate, config.torso_rate, config.arm_rate
+        self._largest_change = rate * control_period
+
+    def initial_state(self, command: Tensor) -> NominalState:
+        """References at their goal, phase zero, standing."""
+        count = len(command)
+        zeros = torch.zeros(count, device=command.device)
+        return NominalState(command.clone(), zeros, zeros.clone())
+
+    def clamp(self, command: Tensor) -> Tensor:
+        """Move the posture of ``command`` (N, 21) into the feasible region; everything else is unchanged."""
+        clamped = command.clone()
+        clamped[:, POSTURE] = self.pose.clamp(command[:, POSTURE])
+        return clamped
+
+    def advance(self, state: NominalState, command: Tensor) -> NominalState:
+        """One control step of reference filter and gait clock towards ``command`` (N, 21)."""
+        change = (command - state.reference).clamp(-self._largest_change, self._largest_change)
+        walks = is_walking(command)
+        fade = self.control_period / self.config.walking_ramp
+        walking = (state.walking + torch.where(walks, fade, -fade)).clamp(0.0, 1.0)
+        step = 2.0 * math.pi * self.config.gait_frequency * self.control_period
+        moves = walking > 0.0
+        phase = torch.where(moves, (state.phase + step) % (2.0 * math.pi), torch.zeros_like(state.phase))
+        return NominalState(state.reference + change, phase, walking)
+
+    def clock(self, state: NominalState) -> Tensor:
+        """Gait clock as the policy sees it (N, 2): sine and cosine of the phase, faded out at rest."""
+        if not self.config.gait_clock:
+            return torch.zeros(len(state.phase), 2, device=state.phase.device)
+        return torch.stack([torch.sin(state.phase), torch.cos(state.phase)], -1) * state.walking[:, None]
+
+    def joint_targets(self, state: NominalState) -> Tensor:
+        """Nominal PD targets (N, 29) [rad], gravity compensated by the table's static torques."""
+        targets = self.default.expand(len(state.phase), NUM_JOINTS).clone()
+        targets[:, ARM_JOINTS] = state.reference[:, ARMS]
+        if self.config.kind == "default":
+            return targets
+        position, torque = self.pose.lookup(state.reference[:, POSTURE])
+        targets[:, LOWER_JOINTS] = position + torque * self._inverse_stiffness
+        if self.config.kind == "march":
+            self._add_march(targets, state)
+        return targets.clamp(self.lower, self.upper)
+
+    def _add_march(self, targets: Tensor, state: NominalState) -> None:
+        config = self.config
+        sine, cosine = torch.sin(state.phase), torch.cos(state.phase)
+        vx, vy, yaw_rate = state.reference[:, VELOCITY].unbind(-1)
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            lift = config.knee_lift * (sign * sine).clamp_min(0.0) * state.walking
+            # The swing foot travels from behind to ahead of the hip: its offset goes with -cos(phase).
+            swing = -sign * cosine * config.stride * state.walking
+            pitch = -swing * vx - 0.5 * lift
+            roll = config.lateral_shift * sine * state.walking
+            offsets = {
+                "hip_pitch": pitch,
+                "hip_roll": roll + swing * vy,
+                "hip_yaw": swing * yaw_rate,
+                "knee": lift,
+                "ankle_pitch": -pitch - lift,
+                "ankle_roll": -roll - swing * vy,
+            }
+            for joint, offset in offsets.items():
+                targets[:, joint_index(f"{side}_{joint}_joint")] += offset

@@ -1,0 +1,40 @@
+"""Named training configurations. A preset is the default configuration with a few fields replaced."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lowlevel.environment import EnvironmentConfig
+from lowlevel.networks import NetworkConfig
+from lowlevel.nominal import NominalConfig
+from lowlevel.terrain import TerrainConfig
+from lowlevel.trainer import TrainingConfig
+
+FLAT = TrainingConfig(network=NetworkConfig())
+
+
+def _environment(**changes: object) -> EnvironmentConfig:
+    return replace(FLAT.environment, **changes)  # type: ignore[arg-type]
+
+
+PRESETS: dict[str, TrainingConfig] = {
+    "flat": FLAT,
+    "simple": replace(FLAT, environment=_environment(terrain=TerrainConfig(tiles=("flat", "irregular")))),
+    # Ablations of the paper
+    "no-vision": replace(FLAT, network=replace(FLAT.network, vision=False)),
+    "no-attention": replace(FLAT, network=replace(FLAT.network, attention=False)),
+    "no-moe": replace(FLAT, network=replace(FLAT.network, mixture=False)),
+    # Ablations of this implementation's additions
+    "nominal-pose": replace(FLAT, environment=_environment(nominal=NominalConfig(kind="pose"))),
+    "nominal-default": replace(FLAT, environment=_environment(nominal=NominalConfig(kind="default"))),
+    "no-clock": replace(
+        FLAT,
+        environment=_environment(
+            nominal=NominalConfig(kind="pose", gait_clock=False),
+            rewards=replace(FLAT.environment.rewards, foot_phase=0.0),
+        ),
+    ),
+    "soft-gains": replace(FLAT, environment=_environment(gains="soft")),
+    "no-mirror": replace(FLAT, ppo=replace(FLAT.ppo, symmetry="none")),
+}
+"""Name to configuration, for ``train-lowlevel --preset``."""

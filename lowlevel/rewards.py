@@ -1,0 +1,197 @@
+"""Rewards: the paper's Table I as a table of pure functions, and additions listed as additions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from lowlevel.commands import is_walking
+from lowlevel.measures import Measurement, arm_error, height_error, stumbles, torso_error, velocity_error
+from robots.g1.constants import joint_index
+
+
+@dataclass(frozen=True)
+class RewardWeights:
+    """Weight per second of each term; names are those of :data:`REWARD_TERMS`."""
+
+    # Table I, task rewards
+    linear_velocity: float = 1.5
+    angular_velocity: float = 2.0
+    base_height: float = 1.0
+    torso_orientation: float = 1.0
+    upper_body_position: float = 1.0
+    termination: float = -200.0
+    # Table I, regularisation
+    action_rate: float = -0.01
+    energy: float = -0.001
+    joint_deviation: float = -0.2
+    feet_stumble: float = -1.0
+    feet_air_time: float = 2.0
+    feet_slippage: float = -1.0
+    large_feet_force: float = -0.005
+    no_fly: float = 0.75
+    # Additions to the paper
+    foot_phase: float = 2.0
+    """Feet follow the gait clock: swing foot up, stance foot down."""
+    base_motion: float = -0.05
+    """Vertical and tumbling motion of the pelvis."""
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Everything a reward term may look at; tensors have one row per robot."""
+
+    measured: Measurement
+    command: Tensor
+    flag: Tensor
+    action: Tensor
+    previous_action: Tensor
+    nominal_target: Tensor
+    phase: Tensor
+    walking: Tensor
+    foot_air_time: Tensor
+    foot_contact_time: Tensor
+    fallen: Tensor
+
+
+def linear_velocity(t: Transition) -> Tensor:
+    """Kernel on the horizontal velocity error, standard deviation 0.5 m/s."""
+    return torch.exp(-velocity_error(t.measured, t.command)[:, :2].square().sum(-1) / 0.25)
+
+
+def angular_velocity(t: Transition) -> Tensor:
+    """Kernel on the yaw rate error, standard deviation 0.5 rad/s."""
+    return torch.exp(-velocity_error(t.measured, t.command)[:, 2].square() / 0.25)
+
+
+def base_height(t: Transition) -> Tensor:
+    """Laplace kernel on the base height error, scale 5 cm: it keeps its slope down to the last millimetre."""
+    return torch.exp(-height_error(t.measured, t.command).abs() / 0.05)
+
+
+def torso_orientation(t: Transition) -> Tensor:
+    """Laplace kernel on the torso attitude error, scale 0.3 rad."""
+    return torch.exp(-torso_error(t.measured, t.command).abs().sum(-1) / 0.3)
+
+
+def upper_body_position(t: Transition) -> Tensor:
+    """Laplace kernel on the summed arm error, scale 1 rad; a third of the error counts when I = 0."""
+    strictness = 0.3 + 0.7 * t.flag[:, 0]
+    return torch.exp(-strictness * arm_error(t.measured, t.command).abs().sum(-1))
+
+
+def termination(t: Transition) -> Tensor:
+    """One on a fall."""
+    return t.fallen.float()
+
+
+def action_rate(t: Transition) -> Tensor:
+    """Squared change of the action."""
+    return (t.action - t.previous_action).square().sum(-1)
+
+
+def energy(t: Transition) -> Tensor:
+    """Mechanical power of all joints [W]."""
+    return (t.measured.robot.joint_torque * t.measured.robot.joint_velocity).abs().sum(-1)
+
+
+_HIPS = [joint_index(f"{side}_hip_{axis}_joint") for side in ("left", "right") for axis in ("roll", "yaw")]
+
+
+def joint_deviation(t: Transition) -> Tensor:
+    """Distance of hip roll and yaw joints from their nominal targets [rad]."""
+    return (t.measured.robot.joint_position - t.nominal_target)[:, _HIPS].abs().sum(-1)
+
+
+def feet_stumble(t: Transition) -> Tensor:
+    """A loaded foot is pushed sideways harder than upwards."""
+    return stumbles(t.measured).float()
+
+
+def feet_air_time(t: Transition) -> Tensor:
+    """Time both feet have kept their roles in single support, up to 0.4 s (Isaac Lab's biped form)."""
+    single_support = t.measured.foot_contact.sum(-1) == 1
+    in_role = torch.where(t.measured.foot_contact, t.foot_contact_time, t.foot_air_time).amin(dim=1)
+    return in_role.clamp(max=0.4) * single_support * is_walking(t.command)
+
+
+def feet_slippage(t: Transition) -> Tensor:
+    """Horizontal speed of loaded feet [m/s]."""
+    return (t.measured.robot.foot_velocity[..., :2].norm(dim=-1) * t.measured.foot_contact).sum(-1)
+
+
+def large_feet_force(t: Transition) -> Tensor:
+    """Contact force beyond 1.5 times the body weight [N], at most 400 N a foot."""
+    return (t.measured.robot.foot_force.norm(dim=-1) - 500.0).clamp(0.0, 400.0).sum(-1)
+
+
+def no_fly(t: Transition) -> Tensor:
+    """Exactly one foot on the ground while walking, both while standing."""
+    return (t.measured.foot_contact.sum(-1) == torch.where(is_walking(t.command), 1, 2)).float()
+
+
+SWING_HEIGHT = 0.08
+"""Height of the sole at mid-swing that :func:`foot_phase` asks for [m]."""
+
+
+def foot_phase(t: Transition) -> Tensor:
+    """Kernel on the sole heights against the gait clock, variance 0.005 m^2."""
+    lift = torch.stack([torch.sin(t.phase), -torch.sin(t.phase)], dim=-1).clamp_min(0.0)
+    wanted = SWING_HEIGHT * lift * t.walking[:, None]
+    return torch.exp(-(t.measured.foot_clearance - wanted).square().sum(-1) / 0.005)
+
+
+def base_motion(t: Transition) -> Tensor:
+    """Squared roll and pitch rates of the pelvis [rad^2/s^2]."""
+    return t.measured.robot.base_angular_velocity[:, :2].square().sum(-1)
+
+
+REWARD_TERMS: dict[str, Callable[[Transition], Tensor]] = {
+    term.__name__: term
+    for term in (
+        linear_velocity,
+        angular_velocity,
+        base_height,
+        torso_orientation,
+        upper_body_position,
+        termination,
+        action_rate,
+        energy,
+        joint_deviation,
+        feet_stumble,
+        feet_air_time,
+        feet_slippage,
+        large_feet_force,
+        no_fly,
+        foot_phase,
+        base_motion,
+    )
+}
+
+
+def compute_rewards(
+    transition: Transition, weights: RewardWeights, control_period: float
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Weighted sum (N,) and the unweighted terms, each (N,).
+
+    Raises:
+        FloatingPointError: naming the term and the robot, if a term is not finite.
+    """
+    total = torch.zeros(len(transition.command), device=transition.command.device)
+    terms = {}
+    for field in fields(weights):
+        weight = getattr(weights, field.name)
+        if weight == 0.0:
+            continue
+        value = REWARD_TERMS[field.name](transition)
+        terms[field.name] = value
+        total += weight * control_period * value
+    if not torch.isfinite(total).all():
+        for name, value in terms.items():
+            bad = torch.nonzero(~torch.isfinite(value))[:, 0]
+            if len(bad):
+                raise FloatingPointError(f"reward term {name!r} is not finite for robot {int(bad[0])}")
+    return total, terms

@@ -1,0 +1,244 @@
+"""N robots in ``mujoco.batch.Batch``: targets in, tensors of shape (N, ...) out.
+
+Nothing above this module touches MuJoCo's data structures, so that another engine can implement the same interface.
+Base and joint quantities are exact; those read from sensors (torso, feet, palms, forces) are one physics substep
+old, as after any ``mj_step``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from torch import Tensor
+
+from robots.g1.constants import FOOT_BODIES, HAND_BODIES, JOINT_NAMES, PELVIS_BODY, SIDES, TORSO_BODY
+from robots.g1.model import effort_limits, joint_limits
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """One instant of N robots, float32; world frame unless the name says otherwise."""
+
+    joint_position: Tensor
+    """(N, 29) [rad]"""
+    joint_velocity: Tensor
+    """(N, 29) [rad/s]"""
+    joint_torque: Tensor
+    """(N, 29) [N m], as applied by the actuators."""
+    base_position: Tensor
+    """Pelvis (N, 3) [m]."""
+    base_quaternion: Tensor
+    """Pelvis (N, 4) wxyz."""
+    base_linear_velocity: Tensor
+    """Pelvis (N, 3) [m/s]."""
+    base_angular_velocity: Tensor
+    """Pelvis (N, 3) [rad/s], in the pelvis frame."""
+    torso_quaternion: Tensor
+    """(N, 4) wxyz."""
+    foot_position: Tensor
+    """Centre of each sole (N, 2, 3) [m], left then right."""
+    foot_velocity: Tensor
+    """(N, 2, 3) [m/s]."""
+    foot_force: Tensor
+    """Net contact force on each foot (N, 2, 3) [N]."""
+    palm_position: Tensor
+    """(N, 2, 3) [m]."""
+    palm_quaternion: Tensor
+    """(N, 2, 4) wxyz."""
+
+
+class BatchSimulation:
+    """Steps N copies of a compiled scene that contains the robot.
+
+    Args:
+        model: scene with the robot of :func:`robots.g1.model.build_spec`, possibly with objects attached.
+        num_robots: number of simulations.
+        decimation: physics steps per control step.
+        num_threads: physics threads.
+        device: where the tensors handed out live.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_robots: int,
+        decimation: int,
+        num_threads: int = 2,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.model = model
+        self.num_robots = num_robots
+        self.decimation = decimation
+        self.device = torch.device(device)
+        self.control_period = decimation * float(model.opt.timestep)
+        self.effort_limits = torch.tensor(effort_limits(model), dtype=torch.float32, device=device)
+        limits = torch.tensor(joint_limits(model), dtype=torch.float32, device=device)
+        self.joint_lower, self.joint_upper = limits[:, 0], limits[:, 1]
+
+        self._batch = Batch(model, num_robots, num_threads)
+        self._sensordata = self._batch.bind("sensordata")
+        self._torque = self._batch.bind("actuator_force")
+        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._ctrl, self._external_force = self._batch.bind("ctrl"), self._batch.bind("xfrc_applied")
+        self._joint_qpos = _contiguous([model.joint(name).qposadr[0] for name in JOINT_NAMES])
+        self._joint_qvel = _contiguous([model.joint(name).dofadr[0] for name in JOINT_NAMES])
+        self._actuators = _contiguous([model.actuator(name).id for name in JOINT_NAMES])
+        self._base_qpos, self._base_qvel = self._free_joint_slices(PELVIS_BODY)
+        self._sensor_columns = {
+            model.sensor(i).name: slice(
+                int(model.sensor_adr[i]), int(model.sensor_adr[i]) + int(model.sensor_dim[i])
+            )
+            for i in range(model.nsensor)
+        }
+        self._per_robot_fields: dict[str, np.ndarray] = {}
+
+    def _free_joint_slices(self, body: str) -> tuple[slice, slice]:
+        joint = self.model.body(body).jntadr[0]
+        if joint < 0 or self.model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+            raise ValueError(f"body {body!r} has no free joint")
+        qpos, qvel = int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
+        return slice(qpos, qpos + 7), slice(qvel, qvel + 6)
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.array(array, dtype=np.float32)).to(self.device)
+
+    def sensor(self, name: str) -> Tensor:
+        """Current value of a named sensor (N, dim)."""
+        return self._tensor(self._sensordata[:, self._sensor_columns[name]])
+
+    def _pair(self, frame: str, quantity: str) -> Tensor:
+        return torch.stack([self.sensor(f"{side}_{frame}_{quantity}") for side in SIDES], dim=1)
+
+    def read(self) -> RobotState:
+        """Snapshot of all robots."""
+        base_qpos, base_qvel = self._qpos[:, self._base_qpos], self._qvel[:, self._base_qvel]
+        return RobotState(
+            joint_position=self._tensor(self._qpos[:, self._joint_qpos]),
+            joint_velocity=self._tensor(self._qvel[:, self._joint_qvel]),
+            joint_torque=self._tensor(self._torque[:, self._actuators]),
+            base_position=self._tensor(base_qpos[:, :3]),
+            base_quaternion=self._tensor(base_qpos[:, 3:]),
+            base_linear_velocity=self._tensor(base_qvel[:, :3]),
+            base_angular_velocity=self._tensor(base_qvel[:, 3:]),
+            torso_quaternion=self.sensor(f"{TORSO_BODY}_quaternion"),
+            foot_position=self._pair("foot", "position"),
+            foot_velocity=self._pair("foot", "velocity"),
+            # The sensor reports the force that the foot exerts on the ground.
+            foot_force=-self._pair("foot", "force"),
+            palm_position=self._pair("palm", "position"),
+            palm_quaternion=self._pair("palm", "quaternion"),
+        )
+
+    def step(self, targets: Tensor) -> None:
+        """Advance one control step with PD targets (N, 29) [rad]."""
+        self._ctrl[:, self._actuators] = targets.detach().cpu().numpy()
+        self._batch.step(nstep=self.decimation)
+
+    def forward(self, ids: Tensor | None = None) -> None:
+        """Recompute the derived quantities of ``ids`` (all by default) without advancing time."""
+        self._batch.forward(None if ids is None else ids.cpu().numpy())
+
+    def reset(
+        self,
+        ids: Tensor,
+        base_position: Tensor,
+        base_quaternion: Tensor,
+        joint_position: Tensor,
+        base_velocity: Tensor | None = None,
+    ) -> None:
+        """Put robots ``ids`` (n,) into a state, at rest unless ``base_velocity`` (n, 6) is given.
+
+        Objects return to the model's initial state. Call :meth:`forward` when all writes are done.
+        """
+        rows = ids.cpu().numpy()
+        self._batch.reset(rows, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        pose = torch.cat([base_position, base_quaternion], -1).cpu().numpy()
+        self._qpos[rows, self._base_qpos] = pose
+        self._qpos[rows, self._joint_qpos] = joint_position.cpu().numpy()
+        self._ctrl[rows, self._actuators] = joint_position.cpu().numpy()
+        if base_velocity is not None:
+            self._qvel[rows, self._base_qvel] = base_velocity.cpu().numpy()
+
+    def push(self, velocity_change: Tensor) -> None:
+        """Add ``velocity_change`` (N, 3) [m/s] to the base's linear velocity."""
+        self._qvel[:, self._base_qvel][:, :3] += velocity_change.cpu().numpy()
+
+    def set_hand_force(self, force: Tensor) -> None:
+        """Apply external forces (N, 2, 3) [N], world frame, at the hands' centres of mass until set again."""
+        for hand, name in enumerate(HAND_BODIES):
+            self._external_force[:, self.model.body(name).id, :3] = force[:, hand].cpu().numpy()
+
+    def object_pose(self, body: str) -> Tensor:
+        """Position and quaternion (N, 7) of a free body."""
+        return self._tensor(self._qpos[:, self._free_joint_slices(body)[0]])
+
+    def object_velocity(self, body: str) -> Tensor:
+        """Linear (world) and angular (body) velocity (N, 6) of a free body."""
+        return self._tensor(self._qvel[:, self._free_joint_slices(body)[1]])
+
+    def set_object_pose(self, ids: Tensor, body: str, pose: Tensor) -> None:
+        """Place a free body at ``pose`` (n, 7), at rest."""
+        qpos, qvel = self._free_joint_slices(body)
+        rows = ids.cpu().numpy()
+        self._qpos[rows, qpos] = pose.cpu().numpy()
+        self._qvel[rows, qvel] = 0.0
+
+    def per_robot(self, field: str) -> np.ndarray:
+        """A model field with one row per robot, to be written in place for domain randomisation."""
+        if field not in self._per_robot_fields:
+            self._per_robot_fields[field] = self._batch.expand(field)
+        return self._per_robot_fields[field]
+
+    def update_constants(self, ids: Tensor) -> None:
+        """Recompute what MuJoCo derives from masses and sizes, after :meth:`per_robot` writes."""
+        self._batch.set_const(ids.cpu().numpy())
+
+    def diverged(self) -> Tensor:
+        """Robots whose state is not finite (N,)."""
+        finite = np.isfinite(self._batch.state).all(axis=1)
+        return torch.from_numpy(~finite).to(self.device)
+
+    def robot_model(self, robot: int) -> mujoco.MjModel:
+        """A copy of one robot's model, with its own field values, for rendering."""
+        return self._batch.get_model(robot)
+
+    def robot_data(self, robot: int) -> mujoco.MjData:
+        """A copy of one robot's simulation state, for rendering."""
+        return self._batch.get_data(robot)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that determines the future of the simulation."""
+        fields = {f"field.{name}": torch.from_numpy(array.copy()) for name, array in self._per_robot_fields.items()}
+        return {"state": torch.from_numpy(self._batch.state.copy()), **fields}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore :meth:`state_dict`.
+
+        Raises:
+            ValueError: if it was saved with another model or number of robots.
+        """
+        if state["state"].shape != self._batch.state.shape:
+            raise ValueError(
+                f"the saved simulation has shape {tuple(state['state'].shape)}, this one "
+                f"{self._batch.state.shape}: resume with the number of robots and the terrain of the saved run"
+            )
+        for name in [key.removeprefix("field.") for key in state if key.startswith("field.")]:
+            self.per_robot(name)[...] = state[f"field.{name}"].numpy()
+        self._batch.state[...] = state["state"].numpy()
+        self._batch.set_const()
+        self._batch.state[...] = state["state"].numpy()
+        self._batch.forward()
+        self._batch.state[...] = state["state"].numpy()
+
+
+def _contiguous(indices: Sequence[int]) -> slice:
+    """The slice that covers ``indices``, which the model must lay out in order without gaps."""
+    start = int(indices[0])
+    if [int(index) for index in indices] != list(range(start, start + len(indices))):
+        raise ValueError("the scene's joints are not in Unitree's order: attach the robot unchanged")
+    return slice(start, start + len(indices))

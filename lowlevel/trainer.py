@@ -1,0 +1,292 @@
+"""The training loop: collect, learn, move the curriculum, log, save. One :class:`Trainer` is one run."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from lowlevel.curriculum import Curriculum, CurriculumConfig
+from lowlevel.distributed import average_over_ranks, rank, world_size
+from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
+from lowlevel.files import atomic_write
+from lowlevel.measures import TRACKING_FIGURES
+from lowlevel.networks import NetworkConfig, ObservationSizes
+from lowlevel.observation import (
+    FRAME,
+    FRAME_SIZE,
+    HISTORY_LENGTH,
+    MIRRORS,
+    PRIVILEGED,
+    PRIVILEGED_SIZE,
+    normalised_columns,
+)
+from lowlevel.ppo import PPO, PPOConfig
+from lowlevel.terrain import MAP_SIZE
+from robots.g1.constants import NUM_JOINTS
+
+STATE_FILE = "training_state.pt"
+LOG_FILE = "log.jsonl"
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """A training run: task, networks, learner and curriculum."""
+
+    total_steps: int = 60_000_000
+    """Environment steps (robots times control steps), over all ranks."""
+    seed: int = 0
+    """Seed of weights, noise, commands and randomisation."""
+    device: str = "cpu"
+    """Where the learner runs; physics always runs on the CPU."""
+    save_interval: float = 300.0
+    """Time between saved training states [s]."""
+    environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+
+
+def observation_sizes() -> ObservationSizes:
+    """Sizes of the environment's observations, as the networks need them."""
+    return ObservationSizes(
+        frame=FRAME_SIZE,
+        history_length=HISTORY_LENGTH,
+        elevation_map=MAP_SIZE,
+        privileged=PRIVILEGED_SIZE,
+        action=NUM_JOINTS,
+    )
+
+
+class Averages:
+    """Running sums of scalars over one iteration."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, Tensor] = {}
+        self._count = 0
+
+    def add(self, values: dict[str, Tensor]) -> None:
+        """Add the means of per-robot ``values``."""
+        self._count += 1
+        for name, value in values.items():
+            self._sums[name] = self._sums.get(name, torch.zeros(())) + value.float().mean().cpu()
+
+    def take(self) -> dict[str, float]:
+        """Means since the last call, averaged over ranks."""
+        names = sorted(self._sums)
+        means = torch.stack([self._sums[name] for name in names]) / max(self._count, 1)
+        average_over_ranks([means])
+        self._sums, self._count = {}, 0
+        return dict(zip(names, means.tolist(), strict=True))
+
+
+class Trainer:
+    """Trains one controller in ``folder``; everything needed to continue is in its ``training_state.pt``."""
+
+    def __init__(self, config: TrainingConfig, folder: Path) -> None:
+        self.config = config
+        self.folder = folder
+        self.environment = PilotEnvironment(config.environment, seed=config.seed + 7919 * rank(), device="cpu")
+        self.curriculum = Curriculum(config.curriculum)
+        self.environment.open_range = self.curriculum.open_range
+        self.ppo = PPO(
+            config=config.ppo,
+            network_config=config.network,
+            sizes=observation_sizes(),
+            mirrors=MIRRORS,
+            num_envs=config.environment.num_robots,
+            device=config.device,
+            command_columns=~normalised_columns(FRAME),
+            privileged_command_columns=~normalised_columns(PRIVILEGED),
+            seed=config.seed,
+        )
+        self.steps = 0
+        self.trained_seconds = 0.0
+        self.fall_rate = 1.0
+        self.observation: dict[str, Tensor] = {}
+        self._stop_requested = False
+
+    # -- the loop ---------------------------------------------------------------------------------------------
+
+    def train(self) -> None:
+        """Run until ``total_steps``, a signal, or an error; the training state is saved in every case but the last."""
+        if not self.observation:
+            self.observation = self.environment.reset(spread_episodes=True)
+        last_save = time.monotonic()
+        with self._signals(), self._progress() as (progress, task), self._log() as log:
+            while self.steps < self.config.total_steps and not self._stop_requested:
+                started = time.monotonic()
+                figures = self.iterate()
+                seconds = time.monotonic() - started
+                self.trained_seconds += seconds
+                figures["speed/steps_per_second"] = self._steps_per_iteration / seconds
+                log(figures)
+                progress.update(task, completed=self.steps, description=self._headline(figures))
+                if time.monotonic() - last_save > self.config.save_interval:
+                    self.save()
+                    last_save = time.monotonic()
+        self.save()
+
+    @property
+    def _steps_per_iteration(self) -> int:
+        return self.config.ppo.steps_per_update * self.config.environment.num_robots * world_size()
+
+    def iterate(self) -> dict[str, float]:
+        """One rollout and one update; returns figures to log."""
+        terms, tracking = Averages(), Averages()
+        started = time.monotonic()
+        for _ in range(self.config.ppo.steps_per_update):
+            action = self.ppo.act(self.observation)
+            result = self.environment.step(action.cpu())
+            self.ppo.record(result.reward, result.terminated, result.truncated, result.next_privileged)
+            self.observation = result.observation
+            terms.add(result.terms | {"total": result.reward / self.environment.control_period})
+            tracking.add(_tracking(result))
+        collection_seconds = time.monotonic() - started
+        losses = self.ppo.update(self.observation)
+        self.steps += self._steps_per_iteration
+
+        mean_terms = terms.take()
+        falls = mean_terms.get("termination", 0.0)
+        self.fall_rate += 0.1 * (falls - self.fall_rate) if self.ppo.updates > 1 else falls - 1.0
+        survived_steps = min(1.0 / max(self.fall_rate, 1e-9), float(self.environment.max_steps))
+        self.curriculum.update(mean_terms, survived_steps / self.environment.max_steps)
+        self.environment.open_range = self.curriculum.open_range
+        figures = {f"reward/{name}": value for name, value in mean_terms.items()}
+        figures |= {f"tracking/{name}": value for name, value in tracking.take().items()}
+        figures |= {f"curriculum/{name}": value for name, value in asdict(self.curriculum.open_range).items()}
+        figures |= {f"learner/{name}": value for name, value in losses.items()}
+        figures["episode/steps_between_falls"] = survived_steps
+        figures["speed/collection_seconds"] = collection_seconds
+        return figures
+
+    # -- saving -----------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """The whole run: learner, environment, curriculum and counters."""
+        return {
+            "ppo": self.ppo.state_dict(),
+            "environment": self.environment.state_dict(),
+            "curriculum": self.curriculum.state_dict(),
+            "observation": self.observation,
+            "steps": self.steps,
+            "trained_seconds": self.trained_seconds,
+            "fall_rate": self.fall_rate,
+        }
+
+    def save(self) -> Path:
+        """Write the training state; a crash while writing leaves the previous one intact."""
+        path = self.folder / STATE_FILE
+        if rank() == 0:
+            state = self.state_dict()
+            atomic_write(path, lambda file: torch.save(state, file))
+        return path
+
+    def load(self, path: Path) -> None:
+        """Continue from a training state that :meth:`save` wrote.
+
+        Raises:
+            ValueError: if the file is damaged or belongs to another configuration.
+        """
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        except (RuntimeError, EOFError, OSError, ValueError) as error:
+            raise ValueError(f"{path} is not a readable training state: {error}") from error
+        self.load_learning(state)
+        self.environment.load_state_dict(state["environment"])
+        self.observation = state["observation"]
+        self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
+
+    def load_learning(self, state: dict[str, Any]) -> None:
+        """Take over weights, optimisers and curriculum, but not the simulation (warm start of another preset)."""
+        try:
+            self.ppo.load_state_dict(state["ppo"])
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise ValueError(f"the training state belongs to other networks: {error}") from error
+        self.curriculum.load_state_dict(state["curriculum"])
+        self.environment.open_range = self.curriculum.open_range
+        self.fall_rate = float(state["fall_rate"])
+
+    # -- progress ---------------------------------------------------------------------------------------------
+
+    def _headline(self, figures: dict[str, float]) -> str:
+        return (
+            f"falls every {figures['episode/steps_between_falls']:.0f} steps"
+            f"  E_v {figures['tracking/E_v']:.2f}  {figures['speed/steps_per_second']:.0f} steps/s"
+        )
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        """Ctrl-C and SIGTERM end the run after the current iteration, with its work saved."""
+
+        def request_stop(number: int, frame: FrameType | None) -> None:
+            self._stop_requested = True
+
+        previous = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    @contextmanager
+    def _progress(self) -> Iterator[tuple[Progress, Any]]:
+        columns = (BarColumn(), TextColumn("{task.percentage:>5.1f}%"), TimeElapsedColumn(), TimeRemainingColumn())
+        with Progress(*columns, TextColumn("{task.description}"), disable=rank() != 0) as progress:
+            yield progress, progress.add_task("starting", total=self.config.total_steps, completed=self.steps)
+
+    @contextmanager
+    def _log(self) -> Iterator[Any]:
+        """Figures go to TensorBoard and, one JSON object per line, to ``log.jsonl``."""
+        if rank() != 0:
+            yield lambda figures: None
+            return
+        writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.steps)
+        path = self.folder / LOG_FILE
+        _drop_entries_after(path, self.steps)
+        with path.open("a") as file:
+
+            def log(figures: dict[str, float]) -> None:
+                for name, value in figures.items():
+                    writer.add_scalar(name, value, self.steps)
+                entry = {"steps": self.steps, "seconds": self.trained_seconds, **figures}
+                file.write(json.dumps({key: float(f"{value:.6g}") for key, value in entry.items()}) + "\n")
+                file.flush()
+
+            try:
+                yield log
+            finally:
+                writer.close()
+
+
+def _tracking(result: StepResult) -> dict[str, Tensor]:
+    return {
+        name: function(result.measured, result.command) for name, (_, function) in TRACKING_FIGURES.items()
+    }
+
+
+def _drop_entries_after(path: Path, steps: int) -> None:
+    """Remove log lines of iterations that a killed run made after its last save."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        try:
+            entry = json.loads(line)
+        except json.JSONDecodeError:  # the line that was being written when the run was killed
+            break
+        if entry["steps"] > steps:
+            break
+        kept.append(line)
+    atomic_write(path, lambda file: file.write("".join(f"{line}\n" for line in kept).encode()))

@@ -1,0 +1,1 @@
+"""Robot definitions; each sub-package holds one robot."""

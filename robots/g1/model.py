@@ -1,0 +1,230 @@
+"""MuJoCo model of the G1, built from the same URDF that Pinocchio reads.
+
+The URDF gives the kinematic tree, inertias, joint limits and effort limits. Added here: the free joint, rotor
+inertia, position actuators with force limits, foot spheres, box-primitive palms, the self-collision pairs that
+matter, and sensors. Meshes are loaded for pictures only.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from robots.g1.constants import (
+    ARMATURE,
+    FOOT_BODIES,
+    GAINS,
+    HAND_BODIES,
+    JOINT_NAMES,
+    PALM_OFFSET,
+    PELVIS_BODY,
+    SIDES,
+    TORSO_BODY,
+    urdf_path,
+)
+
+WORLD_COLLISION = 1
+"""Collision bit of the ground and of everything a foot or a palm can touch."""
+PALM_COLLISION = 2
+"""Collision bit of manipulated objects: palms touch these, feet touch both."""
+
+_FOOT_SPHERES = ((-0.05, 0.025), (-0.05, -0.025), (0.12, 0.03), (0.12, -0.03))
+_FOOT_SPHERE_RADIUS = 0.005
+_FOOT_SPHERE_HEIGHT = -0.03
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """What the compiled model contains."""
+
+    gains: str = "stiff"
+    """Gain set of the position actuators, a key of :data:`robots.g1.constants.GAINS`."""
+    timestep: float = 0.002
+    """Physics step [s]."""
+    visuals: bool = False
+    """Load the visual meshes (for pictures and recordings; never needed for physics)."""
+    elliptic_friction: bool = False
+    """Elliptic friction cones with impratio 10 (grasping) instead of pyramidal ones (locomotion, cheaper)."""
+    floor: bool = True
+    """Add an infinite ground plane named ``floor``."""
+    solver_iterations: int = 3
+    """Newton iterations per step; 3 is enough for feet on the ground, grasping wants more."""
+    friction: float = 1.0
+    """Sliding friction coefficient of floor, feet and palms."""
+
+
+def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:  # noqa: B008 (frozen)
+    """The robot as an editable MuJoCo specification; ``.compile()`` gives nq 36, nv 35, nu 29.
+
+    Raises:
+        ValueError: if the gain set is unknown.
+        FileNotFoundError: if the URDF is not installed.
+    """
+    if options.gains not in GAINS:
+        raise ValueError(f"unknown gain set {options.gains!r}; choose one of {', '.join(GAINS)}")
+    spec = mujoco.MjSpec.from_string(_urdf_with_floating_base(options.visuals))
+    _set_physics(spec, options)
+    for geom in spec.geoms:  # what the URDF brings is visual only
+        geom.contype, geom.conaffinity, geom.group = 0, 0, 2
+    if options.floor:
+        floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+        floor.contype, floor.conaffinity = 0, WORLD_COLLISION
+        floor.friction = [options.friction, 0.005, 0.0001]
+        floor.rgba = [0.55, 0.6, 0.65, 1.0]
+    _add_actuators(spec, options)
+    _add_feet(spec, options)
+    _add_palms(spec, options)
+    _add_self_collision(spec)
+    _add_sensors(spec)
+    return spec
+
+
+def _urdf_with_floating_base(visuals: bool) -> str:
+    """The URDF text with a floating base, without collision meshes, ready for MuJoCo's importer."""
+    path = urdf_path()
+    robot = ElementTree.parse(path).getroot()
+    for link in robot.iter("link"):
+        for child in [*link.findall("collision"), *([] if visuals else link.findall("visual"))]:
+            link.remove(child)
+    meshes = str(path.parent.parent / "meshes")
+    extension = ElementTree.SubElement(robot, "mujoco")
+    ElementTree.SubElement(
+        extension, "compiler", meshdir=meshes, discardvisual="false", fusestatic="true", strippath="true"
+    )
+    ElementTree.SubElement(robot, "link", name="world")
+    joint = ElementTree.SubElement(robot, "joint", name="floating_base", type="floating")
+    ElementTree.SubElement(joint, "parent", link="world")
+    ElementTree.SubElement(joint, "child", link=PELVIS_BODY)
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _set_physics(spec: mujoco.MjSpec, options: ModelOptions) -> None:
+    spec.option.timestep = options.timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # MuJoCo 4.0.0 factors sparse Jacobians wrongly (mujoco#3767), and dense is faster at this size anyway.
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    spec.option.iterations = options.solver_iterations
+    spec.option.ls_iterations = 5 if options.solver_iterations <= 5 else 20
+    if options.elliptic_friction:
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = 10.0
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+
+
+def _add_actuators(spec: mujoco.MjSpec, options: ModelOptions) -> None:
+    gains = GAINS[options.gains]
+    for index, name in enumerate(JOINT_NAMES):
+        joint = spec.joint(name)
+        joint.armature = ARMATURE[index]
+        effort = float(joint.actfrcrange[1])
+        # The limit belongs to the actuator: MuJoCo 4 no longer damps saturated joint limits implicitly.
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        stiffness, damping = float(gains.stiffness[index]), float(gains.damping[index])
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=stiffness, kv=damping)
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        actuator.forcerange = [-effort, effort]
+
+
+def _add_feet(spec: mujoco.MjSpec, options: ModelOptions) -> None:
+    for side, body_name in zip(SIDES, FOOT_BODIES, strict=True):
+        body = spec.body(body_name)
+        body.add_site(name=f"{side}_foot", pos=[0.035, 0.0, _FOOT_SPHERE_HEIGHT - _FOOT_SPHERE_RADIUS])
+        for number, (x, y) in enumerate(_FOOT_SPHERES):
+            sphere = body.add_geom(name=f"{side}_foot_{number}", type=mujoco.mjtGeom.mjGEOM_SPHERE)
+            sphere.size = [_FOOT_SPHERE_RADIUS, 0, 0]
+            sphere.pos = [x, y, _FOOT_SPHERE_HEIGHT]
+            sphere.mass = 0.0
+            sphere.contype, sphere.conaffinity = WORLD_COLLISION, 0
+            sphere.condim = 3
+            sphere.friction = [options.friction, 0.005, 0.0001]
+            sphere.group = 3
+
+
+def _add_palms(spec: mujoco.MjSpec, options: ModelOptions) -> None:
+    """Palm plate, wrist block and finger plate, in the wrist-yaw frame (shape as in OmniContact's G1 model).
+
+    The URDF's rubber hands are visual only, so without these the palms would pass through a box.
+    """
+    for side, body_name in zip(SIDES, HAND_BODIES, strict=True):
+        inwards = -1.0 if side == "left" else 1.0
+        body = spec.body(body_name)
+        body.add_site(name=f"{side}_palm", pos=[PALM_OFFSET[0], inwards * 0.012, PALM_OFFSET[2]])
+        parts = (
+            ("palm", [PALM_OFFSET[0], 0.0, 0.0], [0.05, 0.012, 0.045]),
+            ("wrist", [0.02, 0.0, 0.0], [0.03, 0.025, 0.025]),
+        )
+        for part, position, half_size in parts:
+            box = body.add_geom(name=f"{side}_{part}", type=mujoco.mjtGeom.mjGEOM_BOX)
+            box.pos, box.size = position, half_size
+            box.mass = 0.0
+            box.contype, box.conaffinity = PALM_COLLISION, 0
+            box.condim = 4
+            box.friction = [options.friction, 0.02, 0.0001]
+            # Palm friction is what the scene says, not the larger of palm and object (MuJoCo's default rule).
+            box.priority = 1
+            box.group = 3
+
+
+def _add_self_collision(spec: mujoco.MjSpec) -> None:
+    """Capsules for thighs, shins and forearms, and explicit pairs; contype 0 keeps them out of everything else."""
+    for side in SIDES:
+        for body_name, start, end, radius in (
+            (f"{side}_hip_yaw_link", (0.0, 0.0, -0.02), (-0.07, 0.0, -0.16), 0.055),
+            (f"{side}_knee_link", (0.0, 0.0, -0.04), (0.0, 0.0, -0.27), 0.04),
+            (f"{side}_elbow_link", (0.02, 0.0, -0.01), (0.12, 0.0, -0.01), 0.03),
+        ):
+            capsule = spec.body(body_name).add_geom(name=f"{body_name}_capsule")
+            capsule.type = mujoco.mjtGeom.mjGEOM_CAPSULE
+            capsule.fromto = [*start, *end]
+            capsule.size = [radius, 0, 0]
+            capsule.mass, capsule.contype, capsule.conaffinity, capsule.group = 0.0, 0, 0, 3
+    for name in FOOT_BODIES:
+        plate = spec.body(name).add_geom(name=f"{name}_plate", type=mujoco.mjtGeom.mjGEOM_BOX)
+        plate.pos, plate.size = [0.035, 0.0, -0.02], [0.085, 0.03, 0.012]
+        plate.mass, plate.contype, plate.conaffinity, plate.group = 0.0, 0, 0, 3
+    for side in SIDES:
+        for arm_part in (f"{side}_palm", f"{side}_elbow_link_capsule"):
+            _add_pair(spec, arm_part, f"{side}_hip_yaw_link_capsule")
+        _add_pair(spec, f"{side}_palm", f"{side}_knee_link_capsule")
+    _add_pair(spec, *(f"{name}_plate" for name in FOOT_BODIES))
+    _add_pair(spec, *(f"{side}_knee_link_capsule" for side in SIDES))
+
+
+def _add_pair(spec: mujoco.MjSpec, first: str, second: str) -> None:
+    spec.add_pair(geomname1=first, geomname2=second, condim=1)
+
+
+def _add_sensors(spec: mujoco.MjSpec) -> None:
+    """Frame sensors of feet, palms and torso, and the net contact force on each foot (world frame)."""
+    for side, body_name in zip(SIDES, FOOT_BODIES, strict=True):
+        for frame in (f"{side}_foot", f"{side}_palm"):
+            _add_frame_sensors(spec, frame, mujoco.mjtObj.mjOBJ_SITE)
+        sensor = spec.add_sensor(name=f"{side}_foot_force", type=mujoco.mjtSensor.mjSENS_CONTACT)
+        sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_BODY, body_name
+        # fields: force only; reduction: net force, expressed in the world frame
+        sensor.intprm = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1]
+    _add_frame_sensors(spec, TORSO_BODY, mujoco.mjtObj.mjOBJ_XBODY)
+
+
+def _add_frame_sensors(spec: mujoco.MjSpec, frame: str, kind: mujoco.mjtObj) -> None:
+    for suffix, sensor_type in (
+        ("position", mujoco.mjtSensor.mjSENS_FRAMEPOS),
+        ("quaternion", mujoco.mjtSensor.mjSENS_FRAMEQUAT),
+        ("velocity", mujoco.mjtSensor.mjSENS_FRAMELINVEL),
+    ):
+        spec.add_sensor(name=f"{frame}_{suffix}", type=sensor_type, objtype=kind, objname=frame)
+
+
+def effort_limits(model: mujoco.MjModel) -> np.ndarray:
+    """Torque limit of each actuator (29,) [N m]."""
+    return model.actuator_forcerange[:, 1].copy()
+
+
+def joint_limits(model: mujoco.MjModel) -> np.ndarray:
+    """Position limits of the joints (29, 2) [rad], in Unitree's order."""
+    return np.array([model.joint(name).range for name in JOINT_NAMES])
