@@ -2,8 +2,8 @@
 
 There is no wrapper around the networks. Parameters are broadcast once, gradients are averaged in one flat
 all-reduce per minibatch, and every statistic that steers learning (advantage moments, KL, normaliser moments,
-prototype assignments) is taken over all ranks, so that the ranks' parameters stay identical. Every function here
-leaves its arguments unchanged when only one process runs.
+prototype assignments) is taken over all ranks, so that the ranks' parameters stay identical. Every function
+here does nothing when only one process runs.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from torch import Tensor
 def start(device: str = "cpu") -> torch.device:
     """Join the process group that ``torchrun`` describes in the environment and return this rank's device.
 
-    Without ``WORLD_SIZE`` in the environment, or with 1, nothing is joined. The backend is NCCL for CUDA devices,
-    one GPU per local rank, and gloo otherwise.
+    Without ``WORLD_SIZE`` in the environment, or with 1, nothing is joined. CUDA tensors travel over
+    NCCL, one GPU per local rank, and CPU tensors over gloo.
 
     Raises:
         ValueError: if ``WORLD_SIZE`` is not an integer, or a CUDA device is asked for and there is none.
@@ -30,12 +30,14 @@ def start(device: str = "cpu") -> torch.device:
         raise ValueError("a CUDA device was asked for but PyTorch finds none; use device 'cpu'")
     announced = os.environ.get("WORLD_SIZE", "1")
     if not announced.isdigit():
-        raise ValueError(f"WORLD_SIZE is {announced!r} but must be the number of processes; start with torchrun")
+        raise ValueError(
+            f"WORLD_SIZE is {announced!r} but must be the number of processes; start with torchrun"
+        )
     if int(announced) > 1 and chosen.type == "cuda":
         chosen = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(chosen)
     if int(announced) > 1 and not dist.is_initialized():
-        dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
+        dist.init_process_group("cpu:gloo,cuda:nccl" if chosen.type == "cuda" else "gloo")
     return chosen
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lowlevel.commands import (
+    ARMS,
     HEIGHT,
     POSTURE,
     TORSO,
@@ -27,14 +28,15 @@ from lowlevel.observation import (
     NoiseConfig,
     map_observation,
     push_history,
+    split_frame,
     start_history,
 )
 from lowlevel.randomization import RandomizationConfig, Randomizer
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
-from lowlevel.rotations import conjugate, from_roll_pitch_yaw, multiply, rotate_about_vertical
+from lowlevel.rotations import from_roll_pitch_yaw, multiply, rotate_about_vertical
 from lowlevel.simulation import BatchSimulation
 from lowlevel.terrain import MAP_SIZE, Terrain, TerrainConfig
-from robots.g1.constants import GAINS, LOWER_JOINTS, NUM_JOINTS, WAIST_JOINTS
+from robots.g1.constants import ARM_JOINTS, GAINS, LOWER_JOINTS, NUM_JOINTS, WAIST_JOINTS
 from robots.g1.model import ModelOptions, build_spec
 
 MAP_REFRESH_STEPS = 5
@@ -190,6 +192,7 @@ class PilotEnvironment:
                 self.max_steps, (self.num_robots,), generator=self.generator, device=self.device
             )
         measured = measure(self.simulation.read(), self.terrain)
+        self._advance_nominal()
         self._observe(measured, everyone)
         return self._observation(measured)
 
@@ -197,7 +200,10 @@ class PilotEnvironment:
         """Apply residual ``action`` (N, 29) for one control step of 0.02 s."""
         buffers = self.buffers
         action = action.clamp(-self.config.action_limit, self.config.action_limit)
-        nominal_target = self.motion.joint_targets(self._nominal_state())
+        frame = split_frame(buffers.history[:, -1])
+        nominal_target = self.motion.joint_targets(
+            self._nominal_state(), frame["projected_gravity"], frame["base_angular_velocity"]
+        )
         target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
         applied = torch.where(self.randomizer.state.is_delayed, buffers.previous_target, target)
         buffers.previous_target = target
@@ -287,18 +293,20 @@ class PilotEnvironment:
         neutral = self.sampler.neutral.expand(count, -1)
         reference = torch.where(in_posture, buffers.command[ids], neutral).clone()
         reference[:, VELOCITY] = 0.0
-        state = NominalState(reference, torch.zeros(count, device=self.device), torch.zeros(count, device=self.device))
         buffers.reference[ids], buffers.phase[ids], buffers.walking[ids] = reference, 0.0, 0.0
 
         heading = self._uniform(-torch.pi, torch.pi, count)
-        joint_position = self.motion.joint_targets(state)
+        facing = from_roll_pitch_yaw(heading[:, None] * torch.tensor([0.0, 0.0, 1.0], device=self.device))
+        joint_position = self.motion.default.repeat(count, 1)
+        joint_position[:, ARM_JOINTS] = reference[:, ARMS]
         if self.config.nominal.kind == "default":
-            orientation = from_roll_pitch_yaw(heading[:, None] * torch.tensor([0.0, 0.0, 1.0], device=self.device))
             height = neutral[:, HEIGHT]
+            orientation = facing
         else:
-            joint_position[:, LOWER_JOINTS] = self.motion.pose.lookup(reference[:, POSTURE])[0]
-            orientation = self._posture_orientation(heading, reference[:, TORSO], joint_position[:, WAIST_JOINTS])
             height = reference[:, HEIGHT]
+            joint_position[:, LOWER_JOINTS] = self.motion.pose.lookup(reference[:, POSTURE])[0]
+            waist = joint_position[:, WAIST_JOINTS]
+            orientation = multiply(facing, self.motion.pelvis_attitude(reference[:, TORSO], waist))
         joint_position += self._uniform(-0.02, 0.02, count, NUM_JOINTS)
 
         tile = torch.randint(len(self.terrain.tile_centers), (count,), generator=self.generator, device=self.device)
@@ -317,20 +325,6 @@ class PilotEnvironment:
         buffers.action[ids], buffers.previous_action[ids] = 0.0, 0.0
         buffers.foot_air_time[ids], buffers.foot_contact_time[ids] = 0.0, 0.0
         buffers.episode_step[ids] = 0
-
-    def _posture_orientation(self, heading: Tensor, torso: Tensor, waist: Tensor) -> Tensor:
-        """Pelvis quaternion (n, 4) that puts the torso at ``torso`` (roll, pitch, yaw) with the ``waist`` joints (n, 3)."""
-        zero = torch.zeros_like(heading)
-        yaw, roll, pitch = waist.unbind(-1)
-        waist_rotation = multiply(
-            from_roll_pitch_yaw(torch.stack([zero, zero, yaw], -1)),
-            multiply(
-                from_roll_pitch_yaw(torch.stack([roll, zero, zero], -1)),
-                from_roll_pitch_yaw(torch.stack([zero, pitch, zero], -1)),
-            ),
-        )
-        facing = from_roll_pitch_yaw(torch.stack([zero, zero, heading], -1))
-        return multiply(facing, multiply(from_roll_pitch_yaw(torso), conjugate(waist_rotation)))
 
     # -- observation ------------------------------------------------------------------------------------------
 

@@ -1,9 +1,9 @@
 """The loss of the history encoder: velocity regression and swapped prediction of the next state.
 
-The contrastive part follows the hybrid internal model (HIMLoco, arXiv 2312.11460; PIM, arXiv 2411.14386), which is
-SwAV (arXiv 2006.09882) between the predicted and the true next state. Two constants differ from their code: the cross
-entropy is summed over prototypes, as SwAV defines it, and its temperature is 0.1. Averaged over 64 prototypes at
-temperature 3, the loss is at most 0.07 and has next to no gradient.
+The contrastive part follows the hybrid internal model (HIMLoco, arXiv 2312.11460; PIM, arXiv 2411.14386),
+which is SwAV (arXiv 2006.09882) between the predicted and the true next state. Two constants differ from
+their code: the cross entropy is summed over prototypes, as SwAV defines it, and its temperature is 0.1.
+Averaged over 64 prototypes at temperature 3, the loss is at most 0.07 and has next to no gradient.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class EstimationTerms(NamedTuple):
     assignment_entropy: Tensor
     """Mean entropy of the predicted assignments as a fraction of ln(prototypes): 1 is uniform, 0 certain."""
     usage_entropy: Tensor
-    """Entropy of the batch-mean predicted assignment, same unit: 1 uses all prototypes, 0 has collapsed to one."""
+    """Entropy of the mean predicted assignment, same unit: 1 uses all prototypes, 0 has collapsed to one."""
 
 
 @torch.no_grad()
@@ -81,8 +81,8 @@ def estimation_loss(
 ) -> EstimationTerms:
     """Loss of the estimator for N samples.
 
-    ``velocity`` and ``true_velocity`` (N, 3) [m/s]; ``latent`` predicted from the history and ``target_latent``
-    encoded from the true next state, (N, D) of unit length; ``prototypes`` (K, D).
+    ``velocity`` and ``true_velocity`` (N, 3) [m/s]; ``latent`` predicted from the history and
+    ``target_latent`` encoded from the true next state, (N, D) of unit length; ``prototypes`` (K, D).
     """
     velocity_mse = (velocity - true_velocity).square().mean()
     directions = torch.nn.functional.normalize(prototypes, dim=1)

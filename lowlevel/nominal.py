@@ -1,9 +1,9 @@
 """What the action is a residual on: reference filter, gait clock, and nominal joint targets.
 
 The paper adds the policy's arm output to the commanded arm joints (III-B-2). Here the same is done for legs and
-waist: their nominal target comes from the nominal-pose table, and, as an addition to the paper, a feed-forward
-march lifts the swing leg in time with a gait clock. The training environment and the frozen controller share this
-module, so they cannot drift apart.
+waist, as additions to the paper: their nominal target comes from the nominal-pose table; a feed-forward march lifts
+the swing leg in time with a gait clock; and an ankle strategy leans against tilt, so that the zero action already
+stands. The training environment and the frozen controller share this module, so they cannot drift apart.
 """
 
 from __future__ import annotations
@@ -16,7 +16,16 @@ import torch
 from torch import Tensor
 
 from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, POSTURE, TORSO, VELOCITY, is_walking
-from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, LOWER_JOINTS, NUM_JOINTS, Gains, joint_index
+from lowlevel.rotations import conjugate, from_roll_pitch_yaw, multiply, rotate_inverse
+from robots.g1.constants import (
+    ARM_JOINTS,
+    DEFAULT_POSITION,
+    LOWER_JOINTS,
+    NUM_JOINTS,
+    WAIST_JOINTS,
+    Gains,
+    joint_index,
+)
 from robots.g1.nominal_pose import NominalPose
 
 
@@ -45,6 +54,10 @@ class NominalConfig:
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
     stride: float = 0.22
     """Hip swing per commanded velocity [rad per m/s, rad per rad/s]."""
+    balance_stiffness: float = 2.5
+    """Ankle correction per tilt of the pelvis off its nominal attitude [rad/rad]; 0 switches the strategy off."""
+    balance_damping: float = 0.2
+    """Ankle correction per tilt rate [rad per rad/s]."""
 
 
 @dataclass
@@ -70,10 +83,12 @@ class NominalMotion:
         joint_upper: Tensor,
         control_period: float,
         device: torch.device | str = "cpu",
+        pose: NominalPose | None = None,
     ) -> None:
+        """``pose`` is the nominal-pose table, the package's own by default."""
         self.config = config
         self.control_period = control_period
-        self.pose = NominalPose.load(device)
+        self.pose = NominalPose.load(device) if pose is None else pose
         self.lower, self.upper = joint_lower.to(device), joint_upper.to(device)
         self.default = torch.tensor(DEFAULT_POSITION, dtype=torch.float32, device=device)
         stiffness = torch.tensor(gains.stiffness[LOWER_JOINTS], dtype=torch.float32, device=device)
@@ -111,8 +126,25 @@ class NominalMotion:
             return torch.zeros(len(state.phase), 2, device=state.phase.device)
         return torch.stack([torch.sin(state.phase), torch.cos(state.phase)], -1) * state.walking[:, None]
 
-    def joint_targets(self, state: NominalState) -> Tensor:
-        """Nominal PD targets (N, 29) [rad], gravity compensated by the table's static torques."""
+    def pelvis_attitude(self, torso: Tensor, waist: Tensor) -> Tensor:
+        """Pelvis quaternion (N, 4) in the heading frame that puts the torso at ``torso`` (N, 3; roll, pitch, yaw).
+
+        ``waist`` (N, 3): waist joints in the order of the joint table, yaw, roll, pitch [rad].
+        """
+        zero = torch.zeros_like(waist[:, 0])
+        yaw, roll, pitch = waist.unbind(-1)
+        yawed = from_roll_pitch_yaw(torch.stack([zero, zero, yaw], -1))
+        rolled = from_roll_pitch_yaw(torch.stack([roll, zero, zero], -1))
+        pitched = from_roll_pitch_yaw(torch.stack([zero, pitch, zero], -1))
+        return multiply(from_roll_pitch_yaw(torso), conjugate(multiply(yawed, multiply(rolled, pitched))))
+
+    def joint_targets(
+        self, state: NominalState, projected_gravity: Tensor, base_angular_velocity: Tensor
+    ) -> Tensor:
+        """Nominal PD targets (N, 29) [rad], gravity compensated by the table's static torques.
+
+        ``projected_gravity`` (N, 3) and ``base_angular_velocity`` (N, 3) [rad/s] as measured, pelvis frame.
+        """
         targets = self.default.expand(len(state.phase), NUM_JOINTS).clone()
         targets[:, ARM_JOINTS] = state.reference[:, ARMS]
         if self.config.kind == "default":
@@ -121,6 +153,9 @@ class NominalMotion:
         targets[:, LOWER_JOINTS] = position + torque * self._inverse_stiffness
         if self.config.kind == "march":
             self._add_march(targets, state)
+        if self.config.balance_stiffness > 0.0:
+            attitude = self.pelvis_attitude(state.reference[:, TORSO], position[:, WAIST_JOINTS])
+            self._add_balance(targets, attitude, projected_gravity, base_angular_velocity)
         return targets.clamp(self.lower, self.upper)
 
     def _add_march(self, targets: Tensor, state: NominalState) -> None:
@@ -143,3 +178,13 @@ class NominalMotion:
             }
             for joint, offset in offsets.items():
                 targets[:, joint_index(f"{side}_{joint}_joint")] += offset
+
+    def _add_balance(self, targets: Tensor, attitude: Tensor, gravity: Tensor, angular_velocity: Tensor) -> None:
+        """Ankle strategy: both ankles push against the pelvis' tilt off its nominal ``attitude`` and its rate."""
+        down = torch.zeros_like(gravity)
+        down[:, 2] = -1.0
+        tilt = torch.linalg.cross(gravity, rotate_inverse(attitude, down))
+        correction = self.config.balance_stiffness * tilt + self.config.balance_damping * angular_velocity
+        for axis, joint in ((0, "ankle_roll"), (1, "ankle_pitch")):
+            for side in ("left", "right"):
+                targets[:, joint_index(f"{side}_{joint}_joint")] += correction[:, axis]

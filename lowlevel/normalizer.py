@@ -12,9 +12,10 @@ from lowlevel.distributed import sum_over_ranks
 class RunningNormalizer(nn.Module):
     """Maps ``x`` (..., D) to ``clip((x - mean) / (std + floor))``, column by column.
 
-    Moments are float64 and cover everything passed to :meth:`update`, on all ranks. Columns where ``fixed`` is
-    true pass through unchanged: a command that the curriculum still holds constant has no variance, and would jump
-    by a factor of hundreds on the day it is released. Before the first update the map is the identity (clipped).
+    Moments are float64 and cover everything passed to :meth:`update`, on all ranks. Columns where ``fixed``
+    is true pass through unchanged: a command that the curriculum still holds constant has no variance, and
+    would jump by a factor of hundreds on the day it is released. Before the first update the map is the
+    identity (clipped).
     """
 
     mean: Tensor
@@ -22,8 +23,10 @@ class RunningNormalizer(nn.Module):
     count: Tensor
     fixed: Tensor
 
-    def __init__(self, size: int, fixed: Tensor | None = None, floor: float = 1e-2, clip: float = 10.0) -> None:
-        """``fixed`` (D,) bool, default none; ``floor`` added to the standard deviation; ``clip`` in deviations.
+    def __init__(
+        self, size: int, fixed: Tensor | None = None, floor: float = 1e-2, clip: float = 10.0
+    ) -> None:
+        """``fixed`` (D,) bool, default none; ``floor`` is added to the deviation; ``clip`` in deviations.
 
         Raises:
             ValueError: if ``fixed`` does not have one entry per column.

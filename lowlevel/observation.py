@@ -148,6 +148,12 @@ class FrameBuilder:
         return torch.cat(parts, dim=-1)
 
 
+def split_frame(frame: Tensor) -> dict[str, Tensor]:
+    """The blocks of a frame (N, FRAME_SIZE) by name."""
+    parts = frame.split([block.size for block in FRAME], dim=-1)
+    return {block.name: part for block, part in zip(FRAME, parts, strict=True)}
+
+
 def start_history(frame: Tensor) -> Tensor:
     """A history (N, 6, FRAME_SIZE) that repeats the first frame."""
     return frame[:, None].repeat(1, HISTORY_LENGTH + 1, 1)

@@ -25,6 +25,7 @@ PRESETS: dict[str, TrainingConfig] = {
     "no-attention": replace(FLAT, network=replace(FLAT.network, attention=False)),
     "no-moe": replace(FLAT, network=replace(FLAT.network, mixture=False)),
     # Ablations of this implementation's additions
+    "no-balance": replace(FLAT, environment=_environment(nominal=NominalConfig(balance_stiffness=0.0))),
     "nominal-pose": replace(FLAT, environment=_environment(nominal=NominalConfig(kind="pose"))),
     "nominal-default": replace(FLAT, environment=_environment(nominal=NominalConfig(kind="default"))),
     "no-clock": replace(

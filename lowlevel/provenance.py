@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import platform
 import subprocess
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 from lowlevel.files import atomic_write
+from lowlevel.plain import from_plain
 from lowlevel.trainer import TrainingConfig
 
 RUN_FILE = "run.json"
@@ -62,18 +63,3 @@ def read_training_config(folder: Path) -> TrainingConfig:
         return from_plain(TrainingConfig, json.loads(path.read_text())["config"])
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{path} does not describe a run of this version: {error}") from error
-
-
-def from_plain(kind: type, value: Any) -> Any:
-    """Rebuild nested dataclasses and tuples from what ``dataclasses.asdict`` and JSON made of them."""
-    if is_dataclass(kind):
-        hints = get_type_hints(kind)
-        unknown = set(value) - {f.name for f in fields(kind)}
-        if unknown:
-            raise KeyError(f"{kind.__name__} has no field {sorted(unknown)[0]!r}")
-        return kind(**{name: from_plain(hints[name], item) for name, item in value.items()})
-    if get_origin(kind) is tuple:
-        inner = get_args(kind)
-        kinds = [inner[0]] * len(value) if len(inner) == 2 and inner[1] is Ellipsis else inner
-        return tuple(from_plain(k, item) for k, item in zip(kinds, value, strict=True))
-    return value

@@ -17,9 +17,9 @@ def generalized_advantages(
 ) -> Tensor:
     """Generalised advantage estimates (T, N) (Schulman et al., arXiv 1506.02438).
 
-    All arguments are (T, N). ``next_values[t]`` is the value of the state that step t led to *before* any reset: a
-    truncated episode is bootstrapped with it, a terminated one is worth nothing after its end. No estimate reaches
-    across the end of an episode.
+    All arguments are (T, N). ``next_values[t]`` is the value of the state that step t led to *before* any
+    reset: a truncated episode is bootstrapped with it, a terminated one is worth nothing after its end. No
+    estimate reaches across the end of an episode.
     """
     continues = (~(terminated | truncated)).to(rewards.dtype)
     errors = rewards + gamma * next_values * (~terminated).to(rewards.dtype) - values
@@ -32,19 +32,32 @@ def generalized_advantages(
 
 
 class RolloutStorage:
-    """Preallocated tensors (T, N, ...) of one rollout, filled step by step.
+    """Preallocated tensors of one rollout, filled step by step and reused.
 
-    ``data`` holds one tensor per name; :meth:`flat` views them as (T * N, ...) samples, step-major.
+    ``data`` holds one tensor (T, N, ...) per name. With ``images``, room for the mirror image of every sample
+    follows the rollout in the same memory, so that one index reaches both: :meth:`samples` has (2 T N, ...)
+    rows then.
     """
 
     def __init__(
-        self, steps: int, num_envs: int, shapes: dict[str, tuple[int, ...]], device: torch.device
+        self,
+        steps: int,
+        num_envs: int,
+        shapes: dict[str, tuple[int, ...]],
+        device: torch.device,
+        images: bool = False,
     ) -> None:
         """``shapes``: the shape of one robot's entry at one step, per name; all entries are float32."""
         self.steps = steps
         self.num_envs = num_envs
+        self.size = steps * num_envs
         self.position = 0
-        self.data = {name: torch.zeros(steps, num_envs, *shape, device=device) for name, shape in shapes.items()}
+        rows = self.size * (2 if images else 1)
+        self._samples = {name: torch.zeros(rows, *shape, device=device) for name, shape in shapes.items()}
+        self.data = {
+            name: rows[: self.size].view(steps, num_envs, *shapes[name])
+            for name, rows in self._samples.items()
+        }
         self.terminated = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
 
@@ -59,8 +72,7 @@ class RolloutStorage:
         Raises:
             ValueError: if the rollout is full or a tensor has another shape than was announced.
         """
-        if self.full:
-            raise ValueError(f"the rollout already holds its {self.steps} steps; call update() before acting again")
+        self._require_room()
         for name, value in values.items():
             slot = self.data[name][self.position]
             if value.shape != slot.shape:
@@ -73,16 +85,29 @@ class RolloutStorage:
         Raises:
             ValueError: if the rollout is full.
         """
-        if self.full:
-            raise ValueError(f"the rollout already holds its {self.steps} steps; call update() before acting again")
+        self._require_room()
         self.terminated[self.position] = terminated
         self.truncated[self.position] = truncated
         self.position += 1
 
     def flat(self, name: str) -> Tensor:
-        """The samples of ``name``, (T * N, ...)."""
-        return self.data[name].flatten(0, 1)
+        """What was recorded under ``name``, (T * N, ...), step-major; a view."""
+        return self._samples[name][: self.size]
+
+    def images(self, name: str) -> Tensor:
+        """The room for mirror images of ``name``, in the order of :meth:`flat`; a view, else empty."""
+        return self._samples[name][self.size :]
+
+    def samples(self, name: str) -> Tensor:
+        """Recorded rows of ``name`` followed by their mirror images, if any; a view."""
+        return self._samples[name]
 
     def clear(self) -> None:
         """Start over; the tensors are reused."""
         self.position = 0
+
+    def _require_room(self) -> None:
+        if self.full:
+            raise ValueError(
+                f"the rollout already holds its {self.steps} steps; call update() before acting again"
+            )

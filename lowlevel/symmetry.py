@@ -23,7 +23,7 @@ class TensorMirrors:
         Raises:
             ValueError: if a mirror is missing or has another width than the vector it acts on.
         """
-        widths = dict(zip(MIRRORED_KEYS, (sizes.history, sizes.elevation_map, sizes.privileged, sizes.action)))
+        widths = {key: int(getattr(sizes, key)) for key in MIRRORED_KEYS}
         missing = [key for key in MIRRORED_KEYS if key not in mirrors]
         if missing:
             raise ValueError(f"no mirror was given for {', '.join(missing)}")

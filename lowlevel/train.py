@@ -14,6 +14,7 @@ import torch
 import tyro
 
 from lowlevel import distributed
+from lowlevel.export import export_controller
 from lowlevel.presets import PRESETS
 from lowlevel.provenance import describe_run, write_run_description
 from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig
@@ -62,7 +63,12 @@ def _run(arguments: list[str]) -> None:
         trainer = _resumed(parsed.resume) if parsed.resume else _fresh(parsed, chosen.preset, device)
         print(f"training in {trainer.folder}", flush=True)
         trainer.train()
-        print(f"{trainer.steps} steps in {trainer.trained_seconds / 3600:.2f} h; results lie in {trainer.folder}")
+        if distributed.rank() == 0:
+            export_controller(trainer, trainer.folder / "controller")
+            print(
+                f"{trainer.steps} steps in {trainer.trained_seconds / 3600:.2f} h; the controller lies in "
+                f"{trainer.folder / 'controller'}"
+            )
     finally:
         distributed.stop()
 

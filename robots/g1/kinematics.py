@@ -25,7 +25,6 @@ from robots.g1.constants import (
     JOINT_NAMES,
     PALM_OFFSET,
     PELVIS_BODY,
-
     TORSO_BODY,
     urdf_path,
 )
@@ -37,6 +36,7 @@ FRAMES = (PELVIS_BODY, TORSO_BODY, *FOOT_BODIES, *PALM_FRAMES)
 
 _WXYZ_TO_XYZW = [1, 2, 3, 0]
 _XYZW_TO_WXYZ = [3, 0, 1, 2]
+
 
 @functools.cache
 def build_model() -> pin.Model:
@@ -51,14 +51,15 @@ def build_model() -> pin.Model:
     path = urdf_path()
     model = pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
     if tuple(model.names)[2:] != JOINT_NAMES:
-        raise ValueError(f"{path} does not describe the 29-joint G1: its joints are {', '.join(list(model.names)[2:])}")
+        raise ValueError(f"{path} is not the 29-joint G1: its joints are {', '.join(list(model.names)[2:])}")
     for palm, hand in zip(PALM_FRAMES, HAND_BODIES, strict=True):
-        wrist = model.frames[model.getFrameId(hand)]
-        offset = pin.SE3(np.eye(3), np.array(PALM_OFFSET))
-        placement = wrist.placement * offset
-        model.addFrame(pin.Frame(palm, wrist.parentJoint, model.getFrameId(hand), placement, pin.FrameType.OP_FRAME))
+        hand_id = model.getFrameId(hand)
+        wrist = model.frames[hand_id]
+        pose = wrist.placement * pin.SE3(np.eye(3), np.array(PALM_OFFSET))
+        model.addFrame(pin.Frame(palm, wrist.parentJoint, hand_id, pose, pin.FrameType.OP_FRAME))
     model.armature = np.concatenate([np.zeros(6), ARMATURE])
     return model
+
 
 def to_pinocchio(qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pinocchio's q (..., 36) and v (..., 35) from MuJoCo's ``qpos`` (..., 36) and ``qvel`` (..., 35)."""
@@ -67,18 +68,21 @@ def to_pinocchio(qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.nda
     inverse = quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
     return q, np.concatenate([_rotate(inverse, qvel[..., :3]), qvel[..., 3:]], axis=-1)
 
+
 def to_mujoco(q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """MuJoCo's qpos (..., 36) and qvel (..., 35) from Pinocchio's ``q`` (..., 36) and ``v`` (..., 35)."""
     quaternion = q[..., 3:7]
     qpos = np.concatenate([q[..., :3], quaternion[..., _XYZW_TO_WXYZ], q[..., 7:]], axis=-1)
     return qpos, np.concatenate([_rotate(quaternion, v[..., :3]), v[..., 3:]], axis=-1)
 
+
 def placement(position: np.ndarray, quaternion: np.ndarray) -> pin.SE3:
     """The pose at ``position`` (3,) [m] with MuJoCo's unit ``quaternion`` (4,) w, x, y, z."""
     return pin.XYZQUATToSE3(np.concatenate([position, np.asarray(quaternion)[_WXYZ_TO_XYZW]]))
 
+
 class Kinematics:
-    """Frame placements of one robot; keeps Pinocchio's workspace between calls, so share it between threads never."""
+    """Frame placements of one robot. Keeps Pinocchio's workspace between calls: one object per thread."""
 
     def __init__(self) -> None:
         self.model = build_model()
@@ -90,9 +94,11 @@ class Kinematics:
         pin.framesForwardKinematics(self.model, self._data, q)
         return {name: self._data.oMf[frame].copy() for name, frame in self._frames.items()}
 
+
 def pose_in_pelvis(pelvis: pin.SE3, thing: pin.SE3) -> pin.SE3:
-    """Pose of a thing relative to the pelvis, from the world poses of both."""
+    """Pose of a thing in the pelvis frame, from the world poses of both."""
     return pelvis.actInv(thing)
+
 
 def _rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Rotate ``vector`` (..., 3) by the unit ``quaternion`` (..., 4) x, y, z, w."""

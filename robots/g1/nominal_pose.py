@@ -1,12 +1,13 @@
 """Nominal poses: for every torso posture, leg and waist joints that hold it in balance on two flat feet.
 
-A posture is (h, roll, pitch, yaw): height of the pelvis above the soles [m] and attitude of ``torso_link`` in the heading
-frame [rad], R = Rz(yaw) Ry(pitch) Rx(roll). :class:`NominalPose` interpolates a table that
+A posture is (h, roll, pitch, yaw): height of the pelvis above the soles [m] and attitude of ``torso_link`` in
+the heading frame [rad], R = Rz(yaw) Ry(pitch) Rx(roll). :class:`NominalPose` interpolates a table that
 :mod:`robots.g1.nominal_pose_solver` computes, and says which postures can be held at all.
 """
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,8 +39,8 @@ class Axis:
 def interpolate(axes: Sequence[Axis], table: Tensor, point: Tensor) -> Tensor:
     """Multilinear interpolation; points outside the grid are moved to its border.
 
-    ``table`` (A * B * ..., C) holds C values for every node of the grid of D ``axes`` in row-major order, ``point`` is
-    (N, D); returns (N, C). The 2^D corners around each point are gathered at once.
+    ``table`` (A * B * ..., C) holds C values for every node of the grid of D ``axes`` in row-major order,
+    ``point`` is (N, D); returns (N, C). The 2^D corners around each point are gathered at once.
     """
     index = torch.zeros(len(point), 1, dtype=torch.long, device=point.device)
     weight = torch.ones(len(point), 1, dtype=point.dtype, device=point.device)
@@ -58,9 +59,10 @@ def interpolate(axes: Sequence[Axis], table: Tensor, point: Tensor) -> Tensor:
 class NominalPose:
     """The table on one device.
 
-    ``axes``: height [m], roll, pitch, yaw [rad] of the posture grid. ``values`` (nodes, 30): joint positions [rad] and
-    static gravity torques [N m] of the 15 leg and waist joints. ``roll_limit`` (nodes of height x |yaw|, 1) and
-    ``pitch_limits`` (nodes of height x |roll| x |yaw|, 2) bound the postures that can be held [rad].
+    ``axes``: height [m], roll, pitch, yaw [rad] of the posture grid. ``values`` (nodes, 30): joint positions
+    [rad] and static gravity torques [N m] of the 15 leg and waist joints. ``roll_limit`` (nodes of height x
+    |yaw|, 1) and ``pitch_limits`` (nodes of height x |roll| x |yaw|, 2) bound the postures that can be held
+    [rad].
     """
 
     axes: tuple[Axis, Axis, Axis, Axis]
@@ -86,10 +88,12 @@ class NominalPose:
             grid = (len(height), len(roll), len(pitch), len(yaw))
             half = (len(height), len(roll) // 2 + 1, len(yaw) // 2 + 1)
             nodes = int(np.prod(grid))
-            values = np.concatenate([arrays["positions"], arrays["torques"]], axis=-1).reshape(nodes, 2 * NUM_LOWER_JOINTS)
+            values = np.concatenate([arrays["positions"], arrays["torques"]], axis=-1).reshape(
+                nodes, 2 * NUM_LOWER_JOINTS
+            )
             roll_limit = arrays["roll_limit"].reshape(half[0] * half[2], 1)
             pitch_limits = arrays["pitch_limits"].reshape(int(np.prod(half)), 2)
-        except (OSError, KeyError, ValueError, EOFError) as error:
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path} is not a nominal-pose table ({error}): {remedy}") from error
 
         def tensor(array: np.ndarray) -> Tensor:
@@ -103,24 +107,26 @@ class NominalPose:
     def lookup(self, posture: Tensor) -> tuple[Tensor, Tensor]:
         """Joint positions (N, 15) [rad] and gravity torques (N, 15) [N m] for ``posture`` (N, 4).
 
-        The torques hold the pose with the weight on both feet, so that PD targets of position + torque / stiffness
-        do not sag. Postures outside the grid are moved to its border.
+        The torques hold the pose with the weight on both feet, so that PD targets of position + torque /
+        stiffness do not sag. Postures outside the grid are moved to its border.
         """
         values = interpolate(self.axes, self.values, posture)
         return values[:, :NUM_LOWER_JOINTS], values[:, NUM_LOWER_JOINTS:]
 
     def clamp(self, posture: Tensor) -> Tensor:
-        """The nearest posture that can be held, (N, 4) -> (N, 4): the one feasibility rule for commands.
+        """Move ``posture`` (N, 4) into the region that can be held: the one feasibility rule for commands.
 
-        Height and yaw keep to their ranges, roll to a limit that depends on both, and pitch to limits that depend on
-        all three. Postures inside stay exactly as they are, so clamping twice changes nothing.
+        Height and yaw keep to their ranges, roll to a limit that depends on both, and pitch to limits that
+        depend on all three. Postures inside stay exactly as they are, so clamping twice changes nothing.
         """
         height_axis, roll_axis, _, yaw_axis = self.axes
         half_roll = Axis(0.0, roll_axis.stop, roll_axis.size // 2 + 1)
         half_yaw = Axis(0.0, yaw_axis.stop, yaw_axis.size // 2 + 1)
         height = posture[:, 0].clamp(height_axis.start, height_axis.stop)
         yaw = posture[:, 3].clamp(yaw_axis.start, yaw_axis.stop)
-        limit = interpolate((height_axis, half_yaw), self.roll_limit, torch.stack([height, yaw.abs()], dim=1))[:, 0]
+        limit = interpolate(
+            (height_axis, half_yaw), self.roll_limit, torch.stack([height, yaw.abs()], dim=1)
+        )[:, 0]
         roll = torch.minimum(torch.maximum(posture[:, 1], -limit), limit)
         where = torch.stack([height, roll.abs(), yaw.abs()], dim=1)
         lower, upper = interpolate((height_axis, half_roll, half_yaw), self.pitch_limits, where).unbind(1)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ SHAPE = (len(HEIGHT), len(ROLL), len(PITCH), len(YAW))
 _CENTRE = (len(HEIGHT) - 2, len(ROLL) // 2, int(np.abs(PITCH).argmin()), len(YAW) // 2)
 
 ANCHOR_PITCH = (0.15, 0.6)
-"""Torso pitches that stay available at every height and yaw; where they are not, roll is limited instead [rad]."""
+"""Torso pitches [rad] that stay available at every height and yaw: roll is limited where they would not."""
 INTERPOLATION_TOLERANCE = 0.02
 """Greatest error of feet, torso and pelvis height midway between the nodes [m and rad]."""
 
@@ -44,37 +45,51 @@ def _inward_neighbours(node: tuple[int, ...]) -> list[tuple[int, ...]]:
 
 
 def solve_grid(solver: StanceSolver) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Joint positions (*SHAPE, 15) [rad], gravity torques (*SHAPE, 15) [N m] and soundness (*SHAPE,) of every node.
+    """Joint positions, gravity torques (*SHAPE, 15) [rad, N m] and soundness (*SHAPE,) of every node.
 
-    Each node starts from a neighbour nearer to standing. Half of the grid is solved and the other half mirrored; the
-    robot's own small asymmetry (0.1 mm in its centre of mass) is thereby left out of the table.
+    Each node starts from a neighbour nearer to standing. Half of the grid is solved and the other half
+    mirrored; the robot's own small asymmetry (0.1 mm in its centre of mass) is thereby left out of the table.
     """
-    nodes = [node for node in itertools.product(*map(range, SHAPE)) if node[1] >= _CENTRE[1]]
+    _, roll, _, yaw = np.indices(SHAPE, sparse=True)
+    straight = np.broadcast_to((roll == _CENTRE[1]) & (yaw == _CENTRE[3]), SHAPE)
+    to_solve = straight | (roll > _CENTRE[1]) | ((roll == _CENTRE[1]) & (yaw > _CENTRE[3]))
+    nodes = [tuple(map(int, node)) for node in np.argwhere(to_solve)]
     nodes.sort(key=lambda node: sum(abs(i - c) for i, c in zip(node, _CENTRE, strict=True)))
     stances: dict[tuple[int, ...], Stance] = {}
     for node in nodes:
-        starts = sorted((stances[n] for n in _inward_neighbours(node)), key=lambda stance: not stance.is_sound())
-        for start in [stance.unknowns for stance in starts] or [None]:
+        solved = [stances[neighbour] for neighbour in _inward_neighbours(node) if neighbour in stances]
+        solved.sort(key=lambda stance: not stance.is_sound())
+        starts: list[np.ndarray | None] = [stance.unknowns for stance in solved]
+        for start in starts or [None]:
             stances[node] = solver.solve(_posture(node), start)
+            if straight[node]:
+                stances[node] = _symmetric(solver, _posture(node), stances[node])
             if stances[node].is_sound():
                 break
     positions, torques = np.empty((*SHAPE, 15)), np.empty((*SHAPE, 15))
     sound = np.zeros(SHAPE, dtype=bool)
     for node, stance in stances.items():
         positions[node], torques[node], sound[node] = stance.joints, stance.torques, stance.is_sound()
-    half = _CENTRE[1]
     for array in (positions, torques):
-        array[:, :half] = LOWER_MIRROR(array[:, :half:-1, :, ::-1])
-        array[:, half] = (array[:, half] + LOWER_MIRROR(array[:, half, :, ::-1])) / 2.0
-    sound[:, :half] = sound[:, :half:-1, :, ::-1]
-    sound[:, half] &= sound[:, half, :, ::-1].copy()
+        array[~to_solve] = LOWER_MIRROR(array[:, ::-1, :, ::-1][~to_solve])
+    sound[~to_solve] = sound[:, ::-1, :, ::-1][~to_solve]
     return positions, torques, sound
+
+
+def _symmetric(solver: StanceSolver, posture: np.ndarray, stance: Stance) -> Stance:
+    """The stance halfway between ``stance`` and its mirror image, for a posture without roll and yaw."""
+    unknowns = stance.unknowns.copy()
+    unknowns[1:3] = 0.0  # y and roll of the pelvis
+    unknowns[4:] = (stance.joints + LOWER_MIRROR(stance.joints)) / 2.0
+    symmetric = solver.evaluate(posture, unknowns)
+    return replace(symmetric, torques=(symmetric.torques + LOWER_MIRROR(symmetric.torques)) / 2.0)
 
 
 def safe_cells(solver: StanceSolver, positions: np.ndarray, sound: np.ndarray) -> np.ndarray:
     """Which grid cells are safe to interpolate in, each axis one shorter than SHAPE.
 
-    All corners must be sound, and so must be the stance in the middle, within :data:`INTERPOLATION_TOLERANCE`.
+    All corners must be sound, and so must be the stance in the middle, within
+    :data:`INTERPOLATION_TOLERANCE`.
     """
     corners = list(itertools.product((0, 1), repeat=4))
     safe = np.zeros(tuple(size - 1 for size in SHAPE), dtype=bool)
@@ -84,10 +99,9 @@ def safe_cells(solver: StanceSolver, positions: np.ndarray, sound: np.ndarray) -
             continue
         wanted = np.mean([_posture(node) for node in around], axis=0)
         unknowns, reached = solver.place(np.mean([positions[node] for node in around], axis=0))
-        safe[cell] = (
-            np.abs(reached - wanted).max() < INTERPOLATION_TOLERANCE
-            and solver.evaluate(reached, unknowns).is_sound(INTERPOLATION_TOLERANCE)
-        )
+        stance = solver.evaluate(reached, unknowns)
+        close = np.abs(reached - wanted).max() < INTERPOLATION_TOLERANCE
+        safe[cell] = close and stance.is_sound(INTERPOLATION_TOLERANCE)
     half = safe.shape[1] // 2
     safe[:, :half] = safe[:, : half - 1 : -1, :, ::-1]
     return safe
@@ -96,8 +110,8 @@ def safe_cells(solver: StanceSolver, positions: np.ndarray, sound: np.ndarray) -
 def command_limits(safe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Roll limit (height, |yaw|) and pitch limits (height, |roll|, |yaw|, 2) that keep to safe cells [rad].
 
-    Limits are the same for both signs of roll and of yaw. Each node takes the tightest limits of the cells around it;
-    what is interpolated between nodes is then within the limits of the cell it lies in.
+    Limits are the same for both signs of roll and of yaw. Each node takes the tightest limits of the cells
+    around it; what is interpolated between nodes is then within the limits of the cell it lies in.
     """
     both = safe & safe[:, :, :, ::-1]
     cells = both[:, safe.shape[1] // 2 :, :, safe.shape[3] // 2 :]
@@ -115,7 +129,9 @@ def command_limits(safe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     roll_limit = np.empty((heights + 1, yaws + 1))
     pitch_limits = np.empty((heights + 1, rolls + 1, yaws + 1, 2))
     for h, y in np.ndindex(roll_limit.shape):
-        around = [cell for cell in itertools.product((h - 1, h), (y - 1, y)) if _inside(cell, available.shape)]
+        around = [
+            cell for cell in itertools.product((h - 1, h), (y - 1, y)) if _inside(cell, available.shape)
+        ]
         roll_limit[h, y] = ROLL[_CENTRE[1] + min(available[cell] for cell in around)]
         for r in range(rolls + 1):
             touching = [pitches[i, j, k] for i, k in around for j in (r - 1, r) if 0 <= j < available[i, k]]
@@ -144,7 +160,7 @@ def _longest_run(flags: np.ndarray) -> tuple[int, int]:
 
 
 def fill_unsound(values: np.ndarray, sound: np.ndarray) -> None:
-    """Overwrite unsound nodes of ``values`` (*SHAPE, 15) with the sound one nearest in pitch, else nearer in roll."""
+    """Overwrite unsound nodes of ``values`` (*SHAPE, 15): by the nearest sound pitch or a smaller roll."""
     half = _CENTRE[1]
     indices = np.arange(len(PITCH))
     for r in sorted(range(len(ROLL)), key=lambda r: abs(r - half)):
@@ -165,18 +181,19 @@ def generate(path: Path = PATH) -> None:
     roll_limit, pitch_limits = command_limits(safe)
     fill_unsound(positions, sound)
     fill_unsound(torques, sound)
-    arrays = {
-        "height": HEIGHT,
-        "roll": ROLL,
-        "pitch": PITCH,
-        "yaw": YAW,
-        "positions": positions,
-        "torques": torques,
-        "roll_limit": roll_limit,
-        "pitch_limits": pitch_limits,
-    }
-    np.savez_compressed(path, sound=sound, **{name: array.astype(np.float32) for name, array in arrays.items()})
-    print(f"{sound.mean():.1%} of {sound.size} postures are sound, {safe.mean():.1%} of the cells between them safe")
+    np.savez_compressed(
+        path,
+        height=HEIGHT.astype(np.float32),
+        roll=ROLL.astype(np.float32),
+        pitch=PITCH.astype(np.float32),
+        yaw=YAW.astype(np.float32),
+        positions=positions.astype(np.float32),
+        torques=torques.astype(np.float32),
+        sound=sound,
+        roll_limit=roll_limit.astype(np.float32),
+        pitch_limits=pitch_limits.astype(np.float32),
+    )
+    print(f"{sound.mean():.1%} of {sound.size} postures are sound, {safe.mean():.1%} of the cells safe")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Inverse kinematics of a balanced double stance: leg and waist joints for one torso posture.
 
-A posture (h, roll, pitch, yaw) leaves the G1 four degrees of freedom: how pelvis and waist share the torso's roll and
-pitch, and where the centre of mass sits over the feet. A regularised least-squares problem chooses among them. Its
-unknowns are the pelvis's x, y, roll and pitch and the 15 leg and waist joints; the pelvis's height is h and its yaw is
-zero by construction, so that the heading frame is the world frame. The ground is at z = 0 and the ankles are at x = 0.
+A posture (h, roll, pitch, yaw) leaves the G1 four degrees of freedom: how pelvis and waist share the torso's
+roll and pitch, and where the centre of mass sits over the feet. A regularised least-squares problem chooses
+among them. Its unknowns are the pelvis's x, y, roll and pitch and the 15 leg and waist joints; the pelvis's
+height is h and its yaw is zero by construction, so that the heading frame is the world frame. The ground is
+at z = 0 and the ankles are at x = 0.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _COM_TARGET = np.array([0.03, 0.0])
 _COM_BOX = np.array([[-0.027, -0.11], [0.097, 0.11]])
 _LIMIT_BAND = 0.06
 # Weights per metre or radian. Feet and torso are constraints in all but name.
-_CONSTRAINT_WEIGHT = 300.0
+_CONSTRAINT_WEIGHT = 1000.0
 _COM_WEIGHT, _COM_BOX_WEIGHT = 10.0, 200.0
 _LIMIT_WEIGHT = 20.0
 _BASE_WEIGHT = np.array([0.0, 0.0, 0.5, 0.5])
@@ -58,9 +59,10 @@ _CONVERGED_STEP = 1e-5
 class Stance:
     """A double stance and how sound it is.
 
-    ``unknowns`` (19,): pelvis x, y [m], roll, pitch [rad], then the leg and waist joints [rad]. ``torques`` (15,) hold it
-    against gravity [N m]. ``foot_error`` and ``torso_error`` are what inverse kinematics left over [m and rad]. The
-    margins to the support polygon [m], joint limits [rad] and effort limits [N m] are negative outside.
+    ``unknowns`` (19,): pelvis x, y [m], roll, pitch [rad], then the leg and waist joints [rad]. ``torques``
+    (15,) hold it against gravity [N m]. ``foot_error`` and ``torso_error`` are what inverse kinematics left
+    over [m and rad]. The margins to the support polygon [m], joint limits [rad] and effort limits [N m] are
+    negative outside.
     """
 
     unknowns: np.ndarray
@@ -95,7 +97,8 @@ class StanceSolver:
         self._feet = [self.model.getFrameId(name) for name in FOOT_BODIES]
         self._torso = self.model.getFrameId(TORSO_BODY)
         self._foot_targets = [
-            pin.SE3(np.eye(3), np.array([0.0, side * STANCE_HALF_WIDTH, -SOLE_OFFSET])) for side in (1.0, -1.0)
+            pin.SE3(np.eye(3), np.array([0.0, side * STANCE_HALF_WIDTH, -SOLE_OFFSET]))
+            for side in (1.0, -1.0)
         ]
         self.lower_limit = self.model.lowerPositionLimit[7:][LOWER_JOINTS].copy()
         self.upper_limit = self.model.upperPositionLimit[7:][LOWER_JOINTS].copy()
@@ -103,16 +106,20 @@ class StanceSolver:
         self.effort_limit = self.model.effortLimit[6:][LOWER_JOINTS].copy()
 
     def solve(self, posture: np.ndarray, start: np.ndarray | None = None) -> Stance:
-        """Gauss-Newton for ``posture`` (4,) = (h, roll, pitch, yaw) from ``start`` (19,), by default from standing.
+        """Gauss-Newton for ``posture`` (4,) = (h, roll, pitch, yaw) from ``start`` (19,), else from standing.
 
         A posture that cannot be reached gives a stance that is not sound, not an error.
         """
-        unknowns = np.concatenate([np.zeros(4), DEFAULT_POSITION[LOWER_JOINTS]]) if start is None else start.copy()
+        unknowns = (
+            np.concatenate([np.zeros(4), DEFAULT_POSITION[LOWER_JOINTS]]) if start is None else start.copy()
+        )
         for iteration in range(_MAX_ITERATIONS):
             residual, jacobian = self._residual(posture, unknowns)
-            step = np.linalg.solve(jacobian.T @ jacobian + 1e-6 * np.eye(len(unknowns)), -jacobian.T @ residual)
+            step = np.linalg.solve(
+                jacobian.T @ jacobian + 1e-6 * np.eye(len(unknowns)), -jacobian.T @ residual
+            )
             largest = float(np.abs(step).max())
-            # Full steps restore the feet at once; shorter ones later stop cycling between active joint limits.
+            # Full steps restore the feet at once; shorter ones later stop cycling between active limits.
             step *= min(1.0 if iteration < 15 else 0.3, _MAX_STEP / largest)
             unknowns += step
             unknowns[4:] = np.clip(unknowns[4:], self.lower_limit, self.upper_limit)
@@ -137,17 +144,18 @@ class StanceSolver:
         )
 
     def place(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Stand on the ground with leg and waist ``joints`` (15,), both feet as close to their places as they can be.
+        """Stand on the ground with leg and waist ``joints`` (15,), both feet as near their places as can be.
 
-        Returns the unknowns (19,) and the posture (4,) that result. Used to judge interpolated joints, whose feet are
-        not exactly flat and whose pelvis height is not exactly the one asked for.
+        Returns the unknowns (19,) and the posture (4,) that result. Used to judge interpolated joints, whose
+        feet are not exactly flat and whose pelvis height is not exactly the one asked for.
         """
         q = pin.neutral(self.model)
         q[7:] = DEFAULT_POSITION
         q[7:][LOWER_JOINTS] = joints
         pin.framesForwardKinematics(self.model, self.data, q)
         left, right = (
-            target * self.data.oMf[foot].inverse() for foot, target in zip(self._feet, self._foot_targets, strict=True)
+            target * self.data.oMf[foot].inverse()
+            for foot, target in zip(self._feet, self._foot_targets, strict=True)
         )
         pelvis = pin.SE3.Interpolate(left, right, 0.5)
         roll, pitch, yaw = pin.rpy.matrixToRpy(pelvis.rotation)
@@ -166,7 +174,7 @@ class StanceSolver:
         return q
 
     def gravity_torques(self, q: np.ndarray) -> np.ndarray:
-        """Leg and waist torques (15,) [N m] that hold ``q`` (36,), with least-norm forces at the contact points."""
+        """Leg and waist torques (15,) [N m] that hold ``q`` (36,), with least-norm contact forces."""
         model, data = self.model, self.data
         gravity = pin.computeGeneralizedGravity(model, data, q)
         pin.computeJointJacobians(model, data, q)
@@ -233,7 +241,7 @@ def _excess(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndar
 
 
 def _tangent(roll: float, pitch: float) -> np.ndarray:
-    """Derivative of Pinocchio's velocity (pelvis twist in the pelvis frame, joints) by the unknowns, (35, 19)."""
+    """Derivative of Pinocchio's velocity (pelvis twist in its frame, joints) by the unknowns, (35, 19)."""
     tangent = np.zeros((6 + NUM_JOINTS, 19))
     tangent[0:3, 0:2] = pin.rpy.rpyToMatrix(roll, pitch, 0.0).T[:, 0:2]
     tangent[3:6, 2] = (1.0, 0.0, 0.0)

@@ -1,0 +1,327 @@
+"""Runs a frozen controller through scripted episodes and hands out every control step.
+
+An episode is fixed by its seed and its command schedule alone. Friction, start and observation noise come
+from the episode's own generator, and every batch has the same number of rows, so that an episode's outcome
+depends neither on how many others are evaluated nor on which ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lowlevel.commands import COMMAND_SIZE, HEIGHT, POSTURE
+from lowlevel.controller import Controller, Proprioception
+from lowlevel.environment import MAP_REFRESH_STEPS
+from lowlevel.measures import Measurement, has_fallen, measure
+from lowlevel.observation import NoiseConfig
+from lowlevel.randomization import RandomizationConfig, Randomizer
+from lowlevel.rotations import from_roll_pitch_yaw
+from lowlevel.simulation import BatchSimulation
+from lowlevel.terrain import MAP_SIZE, Terrain, TerrainConfig
+from robots.g1.constants import DEFAULT_POSITION, FOOT_BODIES, GAINS, LOWER_JOINTS, NUM_JOINTS, joint_index
+from robots.g1.model import ModelOptions, build_spec
+
+BATCH = 32
+"""Robots side by side; always as many, as the last digits of a matrix product depend on its row count."""
+TIMESTEP, DECIMATION = 0.002, 10
+"""Physics step [s] and physics steps per control step of the evaluation protocol."""
+START_SPREAD = 1.0
+"""Largest distance of a start from its tile's centre, per axis [m]."""
+JOINT_SPREAD = 0.02
+"""Largest deviation of a joint from the standing pose at the start [rad]."""
+_PROPRIOCEPTION_SIZE = 2 * NUM_JOINTS + 6
+
+
+@dataclass(frozen=True)
+class Push:
+    """A sudden change of the pelvis's velocity."""
+
+    time: float
+    """[s]"""
+    velocity_change: tuple[float, float, float]
+    """World frame [m/s]."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What happens to one robot: it starts standing at rest and is given piecewise constant commands."""
+
+    seed: int
+    """Seed of friction, start and noise."""
+    duration: float
+    """[s]"""
+    starts: tuple[float, ...]
+    """When each command begins [s], ascending, the first at 0."""
+    commands: Tensor
+    """(len(starts), 21); the controller clamps them."""
+    flags: Tensor
+    """Tracking flag I of each command (len(starts),)."""
+    tile: int = 0
+    """Index of the terrain tile to start on."""
+    pushes: tuple[Push, ...] = ()
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One control step of a batch of N rows; rows where ``active`` is false mean nothing."""
+
+    step: int
+    """Control steps before this one."""
+    measured: Measurement
+    """At the end of the step."""
+    command: Tensor
+    """The clamped command that the step tracked (N, 21)."""
+    flag: Tensor
+    """(N, 1)"""
+    since_change: Tensor
+    """Time from the command's begin to the end of the step (N,) [s]."""
+    elevation: Tensor
+    """The noisy elevation map that the controller saw (N, 121) [m]."""
+    gate: Tensor
+    """Expert activations (N, experts)."""
+    active: Tensor
+    """Episodes that were running (N,)."""
+    fell: Tensor
+    """Active episodes that fell in this step (N,)."""
+
+
+def episode_seeds(seed: int, index: int) -> tuple[int, int]:
+    """Two independent seeds for episode ``index`` of an evaluation: for its commands and for its world."""
+    commands, world = np.random.SeedSequence([seed, index]).generate_state(2)
+    return int(commands), int(world)
+
+
+def constant(seed: int, duration: float, command: Tensor, flag: float, tile: int = 0) -> Episode:
+    """An episode with one ``command`` (21,) throughout."""
+    return Episode(seed, duration, (0.0,), command[None], torch.tensor([flag]), tile)
+
+
+class Arena:
+    """One controller on one terrain.
+
+    Args:
+        controller: on the CPU; its memory is reset by every batch.
+        terrain: tiles to start on.
+        noise: observation noise.
+        num_threads: physics threads.
+        batch: robots simulated side by side (N).
+        visuals: load the visual meshes, for pictures and recordings.
+
+    Raises:
+        ValueError: if the controller's gains are none of the simulated robot's, or it runs at another rate.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        terrain: TerrainConfig,
+        noise: NoiseConfig = NoiseConfig(),  # noqa: B008 (frozen)
+        num_threads: int = 2,
+        batch: int = BATCH,
+        visuals: bool = False,
+    ) -> None:
+        self.controller = controller
+        self.batch = batch
+        self.terrain = Terrain(terrain)
+        spec = build_spec(ModelOptions(gains=gain_set(controller), timestep=TIMESTEP, visuals=visuals))
+        for geom in spec.geoms:
+            # MuJoCo takes the larger friction of two geoms unless one has priority; here the feet's decides.
+            if geom.parent.name in FOOT_BODIES:
+                geom.priority = 1
+        self.terrain.add_to(spec)
+        self.simulation = BatchSimulation(spec.compile(), batch, DECIMATION, num_threads)
+        self.period = self.simulation.control_period
+        expected = controller.config.control_period
+        if abs(self.period - expected) > 1e-9:
+            raise ValueError(f"the controller runs every {expected} s, the evaluation every {self.period} s")
+        randomization = RandomizationConfig.for_evaluation()
+        self._randomizer = Randomizer(randomization, self.simulation, torch.Generator())
+        self._proprioception_noise = noise.frame_amplitude()[:_PROPRIOCEPTION_SIZE]
+        self._elevation_noise = noise.elevation
+
+    @property
+    def friction(self) -> Tensor:
+        """Sliding friction of the feet that was drawn for each row (N,)."""
+        return self._randomizer.state.friction[:, 0]
+
+    def run(self, episodes: Sequence[Episode]) -> Iterator[Moment]:
+        """Yield the control steps of up to ``batch`` episodes until all are over; row i is episode i.
+
+        The simulation's state after the step can be read from :attr:`simulation` between two moments.
+        """
+        if not 1 <= len(episodes) <= self.batch:
+            raise ValueError(f"a batch takes 1 to {self.batch} episodes, not {len(episodes)}")
+        rows = torch.arange(self.batch)
+        lengths = torch.zeros(self.batch, dtype=torch.long)
+        lengths[: len(episodes)] = torch.tensor([self._steps(episode.duration) for episode in episodes])
+        starts, commands, flags = self._schedules(episodes)
+        pushes = self._pushes(episodes)
+        frame_noise, map_noise = self._start(episodes)
+        self.controller.reset(self.batch)
+        active = lengths > 0
+        measured = measure(self.simulation.read(), self.terrain)
+        elevation = torch.zeros(self.batch, MAP_SIZE)
+        for step in range(int(lengths.max())):
+            current = (starts <= step).sum(dim=1) - 1
+            command, flag = commands[rows, current], flags[rows, current]
+            if step % MAP_REFRESH_STEPS == 0:
+                elevation = self.terrain.elevation_map(measured.robot.base_position, measured.heading)
+                elevation = elevation + map_noise[step // MAP_REFRESH_STEPS]
+            proprioception = _proprioception(measured, frame_noise[step])
+            targets = self.controller.act(proprioception, elevation, command, flag)
+            if step in pushes:
+                self.simulation.push(pushes[step])
+            self.simulation.step(targets)
+            measured = measure(self.simulation.read(), self.terrain)
+            fallen = has_fallen(measured, self.controller.reference) | self.simulation.diverged()
+            yield Moment(
+                step=step,
+                measured=measured,
+                command=command,
+                flag=flag,
+                since_change=(step + 1 - starts[rows, current]) * self.period,
+                elevation=elevation,
+                gate=self.controller.gate,
+                active=active,
+                fell=active & fallen,
+            )
+            active = active & ~fallen & (step + 1 < lengths)
+            if not active.any():
+                return
+
+    # -- preparing a batch -----------------------------------------------------------------------------------
+
+    def _steps(self, seconds: float) -> int:
+        return round(seconds / self.period)
+
+    def _schedules(self, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor, Tensor]:
+        """First step (N, S), clamped command (N, S, 21) and flag (N, S, 1) of every command."""
+        most = max(len(episode.starts) for episode in episodes)
+        starts = torch.full((self.batch, most), torch.iinfo(torch.long).max)
+        starts[:, 0] = 0
+        commands = self.controller.config.command_space.neutral().repeat(self.batch, most, 1)
+        flags = torch.ones(self.batch, most, 1)
+        for row, episode in enumerate(episodes):
+            count = len(episode.starts)
+            starts[row, :count] = torch.tensor([self._steps(start) for start in episode.starts])
+            commands[row, :count] = episode.commands
+            flags[row, :count, 0] = episode.flags
+        clamped = self.controller.clamp_command(commands.flatten(0, 1))
+        return starts, clamped.reshape(self.batch, most, COMMAND_SIZE), flags
+
+    def _pushes(self, episodes: Sequence[Episode]) -> dict[int, Tensor]:
+        """Velocity changes (N, 3) by control step."""
+        pushes: dict[int, Tensor] = {}
+        for row, episode in enumerate(episodes):
+            for push in episode.pushes:
+                change = pushes.setdefault(self._steps(push.time), torch.zeros(self.batch, 3))
+                change[row] += torch.tensor(push.velocity_change)
+        return pushes
+
+    def _start(self, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor]:
+        """Draw everything random and put all robots on their feet.
+
+        Returns:
+            noise of the proprioception (steps, N, 64) and of the elevation map (refreshes, N, 121).
+        """
+        steps = max(self._steps(episode.duration) for episode in episodes)
+        refreshes = -(-steps // MAP_REFRESH_STEPS)
+        frame_noise = torch.zeros(steps, self.batch, _PROPRIOCEPTION_SIZE)
+        map_noise = torch.zeros(refreshes, self.batch, MAP_SIZE)
+        place, joint_spread = torch.zeros(self.batch, 3), torch.zeros(self.batch, NUM_JOINTS)
+        tiles = torch.zeros(self.batch, dtype=torch.long)
+        for row, episode in enumerate(episodes):
+            generator = torch.Generator().manual_seed(episode.seed)
+            self._randomizer.generator = generator
+            self._randomizer.draw(torch.tensor([row]), hand_load_scale=0.0)
+            place[row] = _symmetric(generator, 3)
+            joint_spread[row] = JOINT_SPREAD * _symmetric(generator, NUM_JOINTS)
+            # Drawn step by step, so that the noise does not depend on how long the episode lasts.
+            for refresh in range(refreshes):
+                when = slice(refresh * MAP_REFRESH_STEPS, min((refresh + 1) * MAP_REFRESH_STEPS, steps))
+                noise = _symmetric(generator, MAP_REFRESH_STEPS, _PROPRIOCEPTION_SIZE)
+                frame_noise[when, row] = self._proprioception_noise * noise[: when.stop - when.start]
+                map_noise[refresh, row] = self._elevation_noise * _symmetric(generator, MAP_SIZE)
+            tiles[row] = episode.tile
+        xy = self.terrain.tile_centers[tiles] + START_SPREAD * place[:, :2]
+        self._stand(xy, torch.pi * place[:, 2], joint_spread)
+        return frame_noise, map_noise
+
+    def _stand(self, xy: Tensor, heading: Tensor, joint_spread: Tensor) -> None:
+        """At rest in the nominal pose of the neutral command, torso upright, feet just above the ground."""
+        zeros = torch.zeros(self.batch)
+        neutral = self.controller.config.command_space.neutral().repeat(self.batch, 1)
+        joints = torch.tensor(DEFAULT_POSITION, dtype=torch.float32).repeat(self.batch, 1)
+        joints[:, LOWER_JOINTS] = self.controller.motion.pose.lookup(neutral[:, POSTURE])[0]
+        pelvis_pitch = -joints[:, joint_index("waist_pitch_joint")]
+        orientation = from_roll_pitch_yaw(torch.stack([zeros, pelvis_pitch, heading], -1))
+        on_ground = torch.cat([xy, zeros[:, None]], -1)
+        highest_ground = -self.terrain.elevation_map(on_ground, heading).amin(dim=1)
+        height = highest_ground + neutral[:, HEIGHT] + 0.005
+        position = torch.cat([xy, height[:, None]], -1)
+        self.simulation.reset(torch.arange(self.batch), position, orientation, joints + joint_spread)
+        self.simulation.forward()
+
+
+def run_all(
+    arena: Arena,
+    episodes: Sequence[Episode],
+    observe: Callable[[int, Sequence[Episode]], Callable[[Moment], None]],
+    advance: Callable[[int], None] = lambda steps: None,
+) -> None:
+    """Run any number of episodes, a batch at a time.
+
+    Args:
+        arena: where.
+        episodes: what.
+        observe: called with the index of a batch's first episode and its episodes; returns what is given
+            every moment.
+        advance: told how many control steps of a batch have passed, for a progress bar.
+    """
+    for first in range(0, len(episodes), arena.batch):
+        batch = episodes[first : first + arena.batch]
+        see = observe(first, batch)
+        steps = 0
+        for moment in arena.run(batch):
+            see(moment)
+            advance(1)
+            steps += 1
+        advance(batch_steps(arena, batch) - steps)
+
+
+def batch_steps(arena: Arena, episodes: Sequence[Episode]) -> int:
+    """Control steps that all batches of ``episodes`` take if nobody falls."""
+    size = arena.batch
+    batches = [episodes[first : first + size] for first in range(0, len(episodes), size)]
+    return sum(max(round(episode.duration / arena.period) for episode in batch) for batch in batches)
+
+
+def gain_set(controller: Controller) -> str:
+    """Name of the gain set that the controller was trained with.
+
+    Raises:
+        ValueError: if it is none of :data:`robots.g1.constants.GAINS`.
+    """
+    for name, gains in GAINS.items():
+        parts = ("stiffness", "damping")
+        if all(np.allclose(getattr(gains, part), getattr(controller.gains, part)) for part in parts):
+            return name
+    raise ValueError(f"the controller's gains are none of the sets that can be simulated: {', '.join(GAINS)}")
+
+
+def _symmetric(generator: torch.Generator, *shape: int) -> Tensor:
+    """Uniform numbers in [-1, 1]."""
+    return 2.0 * torch.rand(*shape, generator=generator) - 1.0
+
+
+def _proprioception(measured: Measurement, noise: Tensor) -> Proprioception:
+    """Measurements with ``noise`` (N, 64) added, in the order of the observation frame."""
+    robot = measured.robot
+    base = (robot.base_angular_velocity, measured.projected_gravity)
+    clean = torch.cat([robot.joint_position, robot.joint_velocity, *base], -1)
+    return Proprioception(*(clean + noise).split([NUM_JOINTS, NUM_JOINTS, 3, 3], dim=-1))

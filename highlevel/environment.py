@@ -1,0 +1,313 @@
+"""N robots under one frozen controller, driven by whole-body commands. Read :meth:`CommandEnvironment.step` first.
+
+One decision of the planner (10 Hz) is an option of five control steps (50 Hz), each of ten physics steps (500 Hz):
+the command is interpolated, the controller acts on fresh measurements at every control step, rewards add up, and an
+episode may end inside the option.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from highlevel.action import ActionMap, interpolate
+from highlevel.task import Decision, ObservationBlock, Task, rows
+from lowlevel.commands import COMMAND_SIZE, HEIGHT, POSTURE
+from lowlevel.controller import Controller, Proprioception
+from lowlevel.measures import Measurement, has_fallen, measure
+from lowlevel.rotations import conjugate, from_roll_pitch_yaw, multiply
+from lowlevel.simulation import BatchSimulation
+from lowlevel.terrain import Terrain, TerrainConfig
+from robots.g1.constants import DEFAULT_POSITION, JOINT_NAMES, LOWER_JOINTS, NUM_JOINTS, PELVIS_BODY, WAIST_JOINTS
+from robots.g1.model import ModelOptions, build_spec
+
+ROBOT_BLOCKS = (
+    ObservationBlock("base_angular_velocity", 3, 1.0),
+    ObservationBlock("projected_gravity", 3, 1.0),
+    ObservationBlock("joint_position", NUM_JOINTS, 0.5),
+    ObservationBlock("joint_velocity", NUM_JOINTS, 5.0),
+    ObservationBlock("previous_command", COMMAND_SIZE, 1.0),
+)
+"""The robot's part of the paper's planner observation: joint positions relative to the default pose, and the limited
+command in units of the action."""
+START_CLEARANCE = 0.005
+"""Height of the soles above the ground when an episode begins [m]."""
+
+
+@dataclass(frozen=True)
+class PhysicsConfig:
+    """How finely the scene is simulated; contact between palms and objects needs more than walking does."""
+
+    timestep: float = 0.002
+    """Physics step [s]."""
+    solver_iterations: int = 12
+    """Newton iterations per step."""
+    num_threads: int = 2
+    """Physics threads."""
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one decision brought; tensors have one row per robot."""
+
+    observation: Tensor
+    """After resets (N, D)."""
+    reward: Tensor
+    """Sum over the control steps of the option (N,)."""
+    terminated: Tensor
+    """Success, failure or fall (N,)."""
+    truncated: Tensor
+    """Out of time (N,)."""
+    success: Tensor
+    """(N,)"""
+    fallen: Tensor
+    """(N,)"""
+    final_observation: Tensor
+    """Before resets (N, D); what an episode that ended saw last."""
+    final_stage: Tensor
+    """Stages passed, before resets (N,)."""
+    failures: dict[int, str]
+    """Robot -> why its episode failed, for the episodes that ended without success."""
+    episode: Tensor
+    """Number of the episode that this decision belongs to (N,)."""
+    duration: Tensor
+    """Time since that episode began (N,) [s]."""
+
+    @property
+    def done(self) -> Tensor:
+        """Episodes that ended (N,)."""
+        return self.terminated | self.truncated
+
+
+class CommandEnvironment:
+    """Batched environment with auto-reset: the planner's action in, observations and rewards out.
+
+    Args:
+        task: a fresh task, which this environment takes over.
+        controller: the frozen controller, or its folder.
+        num_envs: robots side by side.
+        seed: seed of the episodes; robot i runs episodes i, i + N, i + 2 N, ...
+        physics: accuracy and threads.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        controller: Controller | Path | str,
+        num_envs: int = 1,
+        seed: int = 0,
+        physics: PhysicsConfig | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"the number of environments is {num_envs}, but it must be at least 1")
+        self.task = task
+        self.controller = controller if isinstance(controller, Controller) else Controller.load(controller)
+        self.physics = PhysicsConfig() if physics is None else physics
+        self.terrain = Terrain(TerrainConfig())
+        self.simulation = self._build_simulation(num_envs)
+        self.control_period = self.simulation.control_period
+        self.action_map = ActionMap(task.action, self.control_period)
+        self.decision_period = task.action.decision_steps * self.control_period
+        self.max_decisions = round(task.episode_length / self.decision_period)
+        self.blocks = (*task.object_blocks, *ROBOT_BLOCKS, *task.added_blocks)
+        self.observation_size = sum(block.size for block in self.blocks)
+        task.attach(self.simulation)
+
+        self._default = torch.tensor(DEFAULT_POSITION, dtype=torch.float32)
+        self._flag = torch.ones(num_envs, 1)
+        self.seed = seed
+        self.episode = rows(num_envs)
+        self.decisions = torch.zeros(num_envs, dtype=torch.long)
+        self.command = self.controller.config.command_space.neutral().repeat(num_envs, 1)
+        """Limited command (N, 21) that the last decision ended with."""
+        self.measured: Measurement | None = None
+        """Measurement after the last control step, after resets."""
+
+    @property
+    def num_envs(self) -> int:
+        return self.simulation.num_robots
+
+    def _build_simulation(self, num_envs: int) -> BatchSimulation:
+        config, physics = self.controller.config, self.physics
+        options = ModelOptions(
+            timestep=physics.timestep, elliptic_friction=True, solver_iterations=physics.solver_iterations
+        )
+        spec = build_spec(options)
+        for name, stiffness, damping in zip(JOINT_NAMES, config.stiffness, config.damping, strict=True):
+            spec.actuator(name).set_to_position(kp=stiffness, kv=damping)
+        self.terrain.add_to(spec)
+        self.task.add_to(spec)
+        decimation = round(config.control_period / physics.timestep)
+        if abs(decimation * physics.timestep - config.control_period) > 1e-9:
+            raise ValueError(
+                f"the physics step {physics.timestep} s does not divide the control period {config.control_period} s"
+            )
+        return BatchSimulation(spec.compile(), num_envs, decimation, physics.num_threads)
+
+    # -- episodes ---------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def reset(self, seed: int | None = None) -> Tensor:
+        """Begin new episodes everywhere: the next ones, or, with a ``seed``, the first ones of that seed.
+
+        Returns:
+            observation (N, D).
+        """
+        everyone = rows(self.num_envs)
+        if seed is not None:
+            self.seed, self.episode = seed, everyone.clone()
+        elif self.measured is not None:
+            self.episode = self.episode + self.num_envs
+        self._begin(everyone)
+        return self.observe()
+
+    def _begin(self, ids: Tensor) -> None:
+        """Start the current episode number of robots ``ids`` (n,)."""
+        count = len(ids)
+        neutral = self.controller.config.command_space.neutral().repeat(count, 1)
+        pose = self.controller.motion.pose
+        joints = self._default.repeat(count, 1)
+        joints[:, LOWER_JOINTS] = pose.lookup(neutral[:, POSTURE])[0]
+        everything_zero = torch.zeros(count, 3)
+        self.simulation.reset(ids, everything_zero, _facing(torch.zeros(count)), joints)
+        start = self.task.reset(ids, self.seed, self.episode[ids])
+        ground = self.terrain.height(start.position)
+        base = torch.cat([start.position, (ground + neutral[:, HEIGHT] + START_CLEARANCE)[:, None]], -1)
+        orientation = multiply(_facing(start.heading), conjugate(_waist_rotation(joints[:, WAIST_JOINTS])))
+        self.simulation.set_object_pose(ids, PELVIS_BODY, torch.cat([base, orientation], -1))
+        self.simulation.forward(ids)
+        self.controller.reset(self.num_envs, ids)
+        self.command = self.command.clone()
+        self.command[ids] = neutral
+        self.decisions[ids] = 0
+        self.measured = measure(self.simulation.read(), self.terrain)
+
+    # -- stepping ---------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def step(self, action: Tensor) -> StepResult:
+        """One decision: ``action`` (N, 21) in [-1, 1], held as an option of several control steps.
+
+        Raises:
+            RuntimeError: if :meth:`reset` was not called.
+            ValueError: if the action has another shape or is not finite.
+        """
+        if self.measured is None:
+            raise RuntimeError("call reset() before step()")
+        if action.shape != self.command.shape or not bool(torch.isfinite(action).all()):
+            raise ValueError(f"the action must be finite and of shape {tuple(self.command.shape)}")
+        previous = self.command
+        goal = self.controller.clamp_command(self.action_map.limit(previous, action.float()))
+        decision = Decision(previous, goal, (goal - previous) / self.action_map.largest_change)
+        self.command, self.decisions = goal, self.decisions + 1
+
+        count, steps = self.num_envs, self.task.action.decision_steps
+        reward = torch.zeros(count)
+        ended, terminated, success, fallen = (torch.zeros(count, dtype=torch.bool) for _ in range(4))
+        observation = torch.zeros(count, self.observation_size)
+        stage = torch.zeros(count, dtype=torch.long)
+        failures: dict[int, str] = {}
+
+        def close(these: Tensor) -> None:
+            """Take down what the episodes in ``these`` (N,) saw last."""
+            observation[these] = self.observe()[these]
+            stage[these] = self.task.stage[these]
+
+        def explain(these: Tensor) -> None:
+            names = self.task.failures(fallen)
+            failures.update({robot: names[robot] for robot in torch.nonzero(these)[:, 0].tolist()})
+
+        # The planner and the elevation map share their rate of 10 Hz.
+        elevation = self.terrain.elevation_map(self.measured.robot.base_position, self.measured.heading)
+        for number in range(1, steps + 1):
+            command = interpolate(previous, goal, number / steps)
+            self.simulation.step(self.controller.act(_proprioception(self.measured), elevation, command, self._flag))
+            self.measured = measure(self.simulation.read(), self.terrain)
+            falls = has_fallen(self.measured, self.controller.reference) | self.simulation.diverged()
+            outcome = self.task.step(self.measured, decision)
+            reward += torch.where(ended, 0.0, torch.where(falls, self.task.fall_penalty, outcome.reward))
+            now = (falls | outcome.success | outcome.failure) & ~ended
+            if bool(now.any()):
+                fallen |= now & falls
+                success |= now & outcome.success & ~falls
+                close(now)
+                explain(now & ~success)
+                ended |= now
+        terminated = ended.clone()
+        close(~ended)
+        truncated = ~ended & (self.decisions >= self.max_decisions)
+        if bool(truncated.any()):
+            explain(truncated)
+        result = StepResult(
+            observation=observation,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            success=success,
+            fallen=fallen,
+            final_observation=observation,
+            final_stage=stage,
+            failures=failures,
+            episode=self.episode,
+            duration=self.decisions * self.decision_period,
+        )
+        over = torch.nonzero(result.done)[:, 0]
+        if len(over) == 0:
+            return result
+        self.episode = self.episode.clone()
+        self.episode[over] += count
+        self._begin(over)
+        fresh = observation.clone()
+        fresh[over] = self.observe()[over]
+        return replace(result, observation=fresh)
+
+    def observe(self) -> Tensor:
+        """Observation (N, D) in physical units: the paper's blocks, then the task's additions.
+
+        Numbers that are not finite, which only a diverged simulation has, become zero.
+        """
+        measured = self.measured
+        if measured is None:
+            raise RuntimeError("call reset() before observe()")
+        robot = measured.robot
+        time_left = 1.0 - self.decisions / self.max_decisions
+        observation = torch.cat(
+            [
+                self.task.observe_object(measured),
+                robot.base_angular_velocity,
+                measured.projected_gravity,
+                robot.joint_position - self._default,
+                robot.joint_velocity,
+                self.action_map.normalise(self.command),
+                self.task.observe_additions(measured, time_left),
+            ],
+            dim=-1,
+        )
+        return torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _proprioception(measured: Measurement) -> Proprioception:
+    robot = measured.robot
+    return Proprioception(
+        robot.joint_position, robot.joint_velocity, robot.base_angular_velocity, measured.projected_gravity
+    )
+
+
+def _facing(heading: Tensor) -> Tensor:
+    """Quaternion (n, 4) of a rotation by ``heading`` (n,) about the vertical."""
+    zero = torch.zeros_like(heading)
+    return from_roll_pitch_yaw(torch.stack([zero, zero, heading], -1))
+
+
+def _waist_rotation(waist: Tensor) -> Tensor:
+    """Torso relative to pelvis (n, 4) for waist joints (n, 3): yaw, then roll, then pitch."""
+    yaw, roll, pitch = waist.unbind(-1)
+    zero = torch.zeros_like(yaw)
+    turns = [
+        from_roll_pitch_yaw(torch.stack(angles, -1))
+        for angles in ([zero, zero, yaw], [roll, zero, zero], [zero, pitch, zero])
+    ]
+    return multiply(multiply(turns[0], turns[1]), turns[2])

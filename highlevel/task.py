@@ -1,0 +1,169 @@
+"""What a task is to the planner's environment, and how tasks are found by name.
+
+A task is a folder ``tasks/<name>/`` whose package has an attribute ``TASK``: a function without required arguments
+that returns a :class:`Task`. Nothing under ``highlevel`` knows a task by name.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import pkgutil
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import mujoco
+import torch
+from torch import Tensor
+
+from highlevel.action import ActionConfig
+from lowlevel.measures import Measurement
+from lowlevel.simulation import BatchSimulation
+
+
+@dataclass(frozen=True)
+class ObservationBlock:
+    """A named part of the observation and the scale [its unit] that brings it to about one."""
+
+    name: str
+    size: int
+    scale: float
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where robots begin an episode, standing upright."""
+
+    position: Tensor
+    """(n, 2) on the ground [m]."""
+    heading: Tensor
+    """(n,) [rad]"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one control step brought to N robots."""
+
+    reward: Tensor
+    """(N,)"""
+    success: Tensor
+    """The episode is over and won (N,)."""
+    failure: Tensor
+    """The episode is over and lost (N,)."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the planner decided and what became of it; the commands of one option (N, 21) each."""
+
+    previous: Tensor
+    """The command it started from."""
+    goal: Tensor
+    """The limited and feasible command at its end."""
+    change: Tensor
+    """Their difference in units of the largest change of one decision."""
+
+
+class Task(ABC):
+    """A task for N robots at once. The environment owns the robots, the task owns everything else in the scene.
+
+    The order of calls: :meth:`add_to` once, :meth:`attach` once, then :meth:`reset` for robots that begin an episode and
+    :meth:`step` for all of them after every control step; :meth:`observe` at any time.
+    """
+
+    name: str
+    stages: tuple[str, ...]
+    """Names of the stages of an episode, in order; the last one is success."""
+    action: ActionConfig
+    episode_length: float
+    """Longest episode [s]."""
+    fall_penalty: float
+    """Reward for a fall, not positive."""
+    object_blocks: tuple[ObservationBlock, ...]
+    """What the paper's planner sees of the object; it comes first in the observation."""
+    added_blocks: tuple[ObservationBlock, ...]
+    """Additions to the paper's observation; they come last."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """The task's configuration as plain data, for provenance."""
+
+    @abstractmethod
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add objects, contacts and sensors to the scene."""
+
+    @abstractmethod
+    def attach(self, simulation: BatchSimulation) -> None:
+        """Take possession of the compiled scene."""
+
+    @abstractmethod
+    def reset(self, ids: Tensor, seed: int, episode: Tensor) -> Start:
+        """Place the objects of robots ``ids`` (n,) for ``episode`` (n,) and say where the robots stand.
+
+        All randomness comes from :func:`highlevel.draws.uniform` with ``seed`` and ``episode``. The robots have
+        already been reset; the environment moves them and calls ``forward`` afterwards.
+        """
+
+    @abstractmethod
+    def step(self, measured: Measurement, decision: Decision) -> Outcome:
+        """Judge one control step."""
+
+    @abstractmethod
+    def observe_object(self, measured: Measurement) -> Tensor:
+        """The :attr:`object_blocks` (N, ...) of the observation, in the pelvis frame."""
+
+    @abstractmethod
+    def observe_additions(self, measured: Measurement, time_left: Tensor) -> Tensor:
+        """The :attr:`added_blocks` (N, ...) of the observation; ``time_left`` (N,) is a share of the episode."""
+
+    @property
+    @abstractmethod
+    def stage(self) -> Tensor:
+        """Number of stages that each robot has passed in its episode (N,) integers."""
+
+    @abstractmethod
+    def failures(self, fallen: Tensor) -> list[str]:
+        """How each robot's episode would be classified if it ended now (N names), given who has ``fallen`` (N,)."""
+
+    @abstractmethod
+    def expert(self, environment: Any) -> Any:
+        """A scripted expert for a :class:`highlevel.environment.CommandEnvironment` of this task.
+
+        It has ``act(measured) -> action (N, 21)`` and ``reset(ids)``; see :mod:`highlevel.demonstrations`.
+        """
+
+
+def task_names() -> list[str]:
+    """Names of the tasks that are installed."""
+    package = importlib.import_module("tasks")
+    return sorted(module.name for module in pkgutil.iter_modules(package.__path__) if module.ispkg)
+
+
+def load_task(name: str, **options: Any) -> Task:
+    """The task in folder ``tasks/<name>``; ``options`` go to its ``TASK``.
+
+    Raises:
+        ValueError: if there is no such task, or the folder does not hold one.
+    """
+    if name not in task_names():
+        raise ValueError(f"there is no task {name!r}; the tasks are: {', '.join(task_names()) or 'none'}")
+    module: ModuleType = importlib.import_module(f"tasks.{name}")
+    factory = getattr(module, "TASK", None)
+    if factory is None:
+        raise ValueError(f"tasks/{name}/__init__.py has no attribute TASK: it must name the task's class")
+    task = factory(**options)
+    if not isinstance(task, Task):
+        raise ValueError(f"TASK of tasks/{name} makes a {type(task).__name__}, not a highlevel.task.Task")
+    return task
+
+
+def environment_id(name: str) -> str:
+    """Gymnasium id of a task: ``lift_box`` is ``pilot/LiftBox-v0``."""
+    return f"pilot/{''.join(word.capitalize() for word in name.split('_'))}-v0"
+
+
+def rows(count: int, device: torch.device | str = "cpu") -> Tensor:
+    """Indices of all of ``count`` robots."""
+    return torch.arange(count, device=device)

@@ -1,0 +1,406 @@
+"""The frozen controller: whole-body commands in, PD joint targets out, at 50 Hz, for any number of robots.
+
+A controller is a folder. Nothing but this folder is needed to run it, and nothing in it is pickled:
+
+``controller.json``      every convention at full precision, and where the controller comes from
+``weights.safetensors``  policy weights, normaliser and nominal-pose table
+``controller.onnx``      the policy network alone, for other runtimes
+``golden.json``          reference inputs and outputs that any port can be checked against
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from lowlevel.commands import COMMAND_SIZE, CommandSpace
+from lowlevel.files import atomic_write
+from lowlevel.networks import NetworkConfig, ObservationSizes, PilotActor
+from lowlevel.nominal import NominalConfig, NominalMotion, NominalState
+from lowlevel.observation import (
+    FRAME,
+    FRAME_SIZE,
+    HISTORY_LENGTH,
+    FrameBuilder,
+    map_observation,
+    normalised_columns,
+    push_history,
+    start_history,
+)
+from lowlevel.plain import from_plain
+from lowlevel.terrain import MAP_SIZE
+from robots.g1.constants import DEFAULT_POSITION, JOINT_NAMES, NUM_JOINTS, Gains
+from robots.g1.nominal_pose import Axis, NominalPose
+
+FORMAT_VERSION = 1
+CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
+    "controller.json",
+    "weights.safetensors",
+    "controller.onnx",
+    "golden.json",
+)
+
+
+class ControllerError(ValueError):
+    """A controller folder cannot be used; the message says which file is at fault and why."""
+
+
+@dataclass(frozen=True)
+class Proprioception:
+    """What the controller measures on N robots."""
+
+    joint_position: Tensor
+    """(N, 29) [rad], Unitree's order."""
+    joint_velocity: Tensor
+    """(N, 29) [rad/s]."""
+    base_angular_velocity: Tensor
+    """(N, 3) [rad/s], pelvis frame."""
+    projected_gravity: Tensor
+    """Unit gravity direction in the pelvis frame (N, 3); (0, 0, -1) when upright."""
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """Contents of ``controller.json`` that define behaviour."""
+
+    joint_names: tuple[str, ...]
+    default_position: tuple[float, ...]
+    """[rad]"""
+    joint_lower: tuple[float, ...]
+    """[rad]"""
+    joint_upper: tuple[float, ...]
+    """[rad]"""
+    stiffness: tuple[float, ...]
+    """[N m/rad]"""
+    damping: tuple[float, ...]
+    """[N m s/rad]"""
+    action_scale: tuple[float, ...]
+    """[rad]"""
+    action_limit: float
+    """Largest action, in action scales."""
+    control_period: float
+    """[s]"""
+    command_space: CommandSpace
+    nominal: NominalConfig
+    network: NetworkConfig
+    pose_axes: tuple[Axis, Axis, Axis, Axis]
+    """Grid of the nominal-pose table: height, roll, pitch, yaw."""
+
+
+@dataclass
+class _Memory:
+    """State carried between control steps, one row per robot."""
+
+    nominal: NominalState
+    action: Tensor
+    history: Tensor
+    is_fresh: Tensor
+    """Robots that have not acted since their reset: their history starts with the next frame."""
+
+
+class Controller:
+    """A frozen PILOT policy with its history, reference filter and gait clock.
+
+    Call :meth:`reset` once for a number of robots, then :meth:`act` every control period.
+    """
+
+    def __init__(
+        self,
+        config: ControllerConfig,
+        actor: PilotActor,
+        pose: NominalPose,
+        provenance: dict[str, Any],
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.config = config
+        self.provenance = provenance
+        self.device = torch.device(device)
+        self.actor = actor.to(device).eval().requires_grad_(False)
+        self.gains = Gains(
+            np.array(config.stiffness), np.array(config.damping), np.array(config.action_scale)
+        )
+        self.motion = NominalMotion(
+            config.nominal,
+            self.gains,
+            torch.tensor(config.joint_lower),
+            torch.tensor(config.joint_upper),
+            config.control_period,
+            device,
+            pose,
+        )
+        self.action_scale = torch.tensor(config.action_scale, device=device)
+        self._build_frame = FrameBuilder(config.command_space, self.motion, device)
+        self._memory: _Memory | None = None
+        self.gate = torch.zeros(0)
+        """Expert activations of the last :meth:`act` (N, 4)."""
+
+    # -- control ----------------------------------------------------------------------------------------------
+
+    def reset(self, num_robots: int, ids: Tensor | None = None) -> None:
+        """Forget everything about robots ``ids`` (all ``num_robots`` by default): history, last action, clock."""
+        if self._memory is None or ids is None or len(self._memory.action) != num_robots:
+            neutral = self.config.command_space.neutral(self.device).repeat(num_robots, 1)
+            self._memory = _Memory(
+                nominal=self.motion.initial_state(neutral),
+                action=torch.zeros(num_robots, NUM_JOINTS, device=self.device),
+                history=torch.zeros(num_robots, HISTORY_LENGTH + 1, FRAME_SIZE, device=self.device),
+                is_fresh=torch.ones(num_robots, dtype=torch.bool, device=self.device),
+            )
+            return
+        memory = self._memory
+        memory.nominal.reference[ids] = self.config.command_space.neutral(self.device)
+        memory.nominal.phase[ids] = 0.0
+        memory.nominal.walking[ids] = 0.0
+        memory.action[ids] = 0.0
+        memory.is_fresh[ids] = True
+
+    @torch.no_grad()
+    def act(
+        self, proprioception: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor
+    ) -> Tensor:
+        """PD targets (N, 29) [rad] for the next control period.
+
+        Args:
+            proprioception: measurements.
+            elevation_map: vertical distance base - terrain (N, 121) [m], egocentric, rows along x.
+            command: whole-body command (N, 21); its posture is clamped to the feasible region.
+            flag: tracking flag I (N, 1).
+
+        Raises:
+            RuntimeError: if :meth:`reset` was not called for this number of robots.
+        """
+        memory = self._memory
+        if memory is None or len(memory.action) != len(command):
+            raise RuntimeError(f"call reset({len(command)}) before act() with {len(command)} robots")
+        command = self.motion.clamp(command)
+        memory.nominal = self.motion.advance(memory.nominal, command)
+        frame = self._build_frame(
+            proprioception.joint_position,
+            proprioception.joint_velocity,
+            proprioception.base_angular_velocity,
+            proprioception.projected_gravity,
+            command,
+            memory.action,
+            memory.nominal,
+        )
+        memory.history = torch.where(
+            memory.is_fresh[:, None, None], start_history(frame), push_history(memory.history, frame)
+        )
+        memory.is_fresh = torch.zeros_like(memory.is_fresh)
+        output = self.actor(memory.history.flatten(1), map_observation(elevation_map), flag)
+        self.gate = output.gate
+        limit = self.config.action_limit
+        memory.action = output.mean.clamp(-limit, limit)
+        nominal = self.motion.joint_targets(
+            memory.nominal, proprioception.projected_gravity, proprioception.base_angular_velocity
+        )
+        return nominal + memory.action * self.action_scale
+
+    def clamp_command(self, command: Tensor) -> Tensor:
+        """The command (N, 21) that is observed and scored in place of ``command``."""
+        return self.motion.clamp(command)
+
+    @property
+    def reference(self) -> Tensor:
+        """Slewed command (N, 21) that the nominal motion follows."""
+        if self._memory is None:
+            raise RuntimeError("call reset() first")
+        return self._memory.nominal.reference
+
+    @property
+    def gait_phase(self) -> Tensor:
+        """Gait phase (N,) [rad] of the next step."""
+        if self._memory is None:
+            raise RuntimeError("call reset() first")
+        return self._memory.nominal.phase
+
+    # -- folders ----------------------------------------------------------------------------------------------
+
+    @classmethod
+    def load(cls, folder: Path | str, device: torch.device | str = "cpu") -> Controller:
+        """Load a controller folder.
+
+        Raises:
+            ControllerError: if a file is missing, damaged, of another version, or has weights that are not finite.
+        """
+        folder = Path(folder)
+        description = _read_json(folder, CONFIG_FILE)
+        version = description.get("format_version")
+        if version != FORMAT_VERSION:
+            raise ControllerError(f"{folder / CONFIG_FILE} has format version {version}, this code reads {FORMAT_VERSION}")
+        try:
+            config = from_plain(ControllerConfig, description["config"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ControllerError(f"{folder / CONFIG_FILE} is incomplete: {error}") from error
+        if config.joint_names != JOINT_NAMES:
+            raise ControllerError(f"{folder / CONFIG_FILE} is for a robot with other joints or another joint order")
+        tensors = _read_weights(folder)
+        actor = PilotActor(actor_sizes(), config.network, ~normalised_columns(FRAME))
+        pose_tensors = {name: tensors.pop(f"nominal_pose.{name}", None) for name in _POSE_TENSORS}
+        if any(tensor is None for tensor in pose_tensors.values()):
+            raise ControllerError(f"{folder / WEIGHTS_FILE} holds no nominal-pose table: export the controller again")
+        try:
+            actor.load_state_dict(tensors)
+        except RuntimeError as error:
+            first_line = str(error).splitlines()[-1].strip()
+            raise ControllerError(f"{folder / WEIGHTS_FILE} does not fit {CONFIG_FILE}: {first_line}") from error
+        pose = NominalPose(config.pose_axes, *(pose_tensors[name].to(device) for name in _POSE_TENSORS))
+        return cls(config, actor, pose, description["provenance"], device)
+
+    def save(self, folder: Path | str, golden_seed: int = 0) -> None:
+        """Write the folder: JSON, weights, ONNX and golden vectors; each file is complete or absent."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        pose = {f"nominal_pose.{name}": getattr(self.motion.pose, name).cpu() for name in _POSE_TENSORS}
+        weights = {name: tensor.cpu().contiguous() for name, tensor in self.actor.state_dict().items()}
+        atomic_write(folder / WEIGHTS_FILE, lambda file: file.write(save(weights | pose)))
+        export_onnx(self.actor, folder / ONNX_FILE)
+        golden = golden_vectors(self, golden_seed)
+        atomic_write(folder / GOLDEN_FILE, lambda file: file.write(json.dumps(golden).encode()))
+        description = {
+            "format_version": FORMAT_VERSION,
+            "config": asdict(self.config),
+            "observation_layout": observation_layout(),
+            "provenance": self.provenance,
+        }
+        atomic_write(folder / CONFIG_FILE, lambda file: file.write(json.dumps(description, indent=1).encode()))
+
+
+_POSE_TENSORS = ("values", "roll_limit", "pitch_limits")
+
+
+def actor_sizes() -> ObservationSizes:
+    """Sizes of what the policy sees; the critic's part plays no role in a frozen controller."""
+    return ObservationSizes(FRAME_SIZE, HISTORY_LENGTH, MAP_SIZE, privileged=3, action=NUM_JOINTS)
+
+
+def observation_layout() -> list[dict[str, Any]]:
+    """Blocks of a proprioceptive frame in order, for whoever ports the controller."""
+    start, layout = 0, []
+    for block in FRAME:
+        layout.append({"name": block.name, "start": start, "stop": start + block.size})
+        start += block.size
+    return layout
+
+
+def content_hash(folder: Path | str) -> str:
+    """Identity of a controller: SHA-256 over configuration and weights, 16 hexadecimal digits."""
+    digest = hashlib.sha256()
+    description = _read_json(Path(folder), CONFIG_FILE)
+    digest.update(json.dumps(description["config"], sort_keys=True).encode())
+    digest.update((Path(folder) / WEIGHTS_FILE).read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def add_metrics(folder: Path | str, metrics: dict[str, Any]) -> None:
+    """Write measured figures into ``controller.json``; the identity does not change."""
+    path = Path(folder) / CONFIG_FILE
+    description = _read_json(Path(folder), CONFIG_FILE)
+    description["provenance"] = description["provenance"] | {"metrics": metrics}
+    atomic_write(path, lambda file: file.write(json.dumps(description, indent=1).encode()))
+
+
+def export_onnx(actor: PilotActor, path: Path) -> None:
+    """The policy network as ONNX: history, elevation_map, flag -> action, gate, velocity, latent; batch size is free."""
+    sizes = actor.sizes
+    rows = torch.export.Dim("robots")
+    inputs = (torch.zeros(2, sizes.history), torch.zeros(2, sizes.elevation_map), torch.zeros(2, 1))
+    program = torch.onnx.export(
+        actor,
+        inputs,
+        dynamo=True,
+        verbose=False,
+        input_names=["history", "elevation_map", "flag"],
+        output_names=["action", "gate", "velocity", "latent"],
+        dynamic_shapes=({0: rows}, {0: rows}, {0: rows}),
+    )
+    assert program is not None
+    atomic_write(path, lambda file: file.write(program.model_proto.SerializeToString()))
+
+
+def golden_vectors(controller: Controller, seed: int, steps: int = 3, robots: int = 4) -> dict[str, Any]:
+    """Random measurements and commands over a few control steps, with the targets that belong to them."""
+    generator = torch.Generator().manual_seed(seed)
+    lower, upper = controller.config.command_space.bounds()
+    twin = replace_memory(controller, robots)
+    records = []
+    for _ in range(steps):
+        position = torch.tensor(DEFAULT_POSITION, dtype=torch.float32) + 0.2 * torch.randn(
+            robots, NUM_JOINTS, generator=generator
+        )
+        gravity = torch.nn.functional.normalize(
+            torch.tensor([0.0, 0.0, -1.0]) + 0.1 * torch.randn(robots, 3, generator=generator), dim=-1
+        )
+        record = {
+            "joint_position": position,
+            "joint_velocity": torch.randn(robots, NUM_JOINTS, generator=generator),
+            "base_angular_velocity": 0.5 * torch.randn(robots, 3, generator=generator),
+            "projected_gravity": gravity,
+            "elevation_map": 0.75 + 0.05 * torch.randn(robots, MAP_SIZE, generator=generator),
+            "command": lower + (upper - lower) * torch.rand(robots, COMMAND_SIZE, generator=generator),
+            "flag": torch.ones(robots, 1),
+        }
+        record["targets"] = replay(twin, record)
+        assert twin._memory is not None
+        record["history"] = twin._memory.history.flatten(1)
+        record["action"] = twin._memory.action
+        records.append({name: value.tolist() for name, value in record.items()})
+    return {"robots": robots, "steps": records}
+
+
+def replay(controller: Controller, record: dict[str, Tensor]) -> Tensor:
+    """Targets (N, 29) of ``controller`` for one recorded step of golden vectors."""
+    measured = Proprioception(
+        record["joint_position"],
+        record["joint_velocity"],
+        record["base_angular_velocity"],
+        record["projected_gravity"],
+    )
+    return controller.act(measured, record["elevation_map"], record["command"], record["flag"])
+
+
+def replace_memory(controller: Controller, robots: int) -> Controller:
+    """A controller on the CPU with the same weights and a fresh memory for ``robots`` robots."""
+    pose = controller.motion.pose
+    cpu_pose = replace(pose, **{name: getattr(pose, name).cpu() for name in _POSE_TENSORS})
+    actor = PilotActor(controller.actor.sizes, controller.config.network, ~normalised_columns(FRAME))
+    actor.load_state_dict({name: tensor.cpu() for name, tensor in controller.actor.state_dict().items()})
+    twin = Controller(controller.config, actor, cpu_pose, controller.provenance)
+    twin.reset(robots)
+    return twin
+
+
+def _read_json(folder: Path, name: str) -> dict[str, Any]:
+    path = folder / name
+    if not path.is_file():
+        raise ControllerError(f"{path} is missing: give a controller folder, such as one under checkpoints/lowlevel")
+    try:
+        content = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ControllerError(f"{path} is damaged: {error}") from error
+    if not isinstance(content, dict):
+        raise ControllerError(f"{path} is damaged: it does not hold a JSON object")
+    return content
+
+
+def _read_weights(folder: Path) -> dict[str, Tensor]:
+    path = folder / WEIGHTS_FILE
+    if not path.is_file():
+        raise ControllerError(f"{path} is missing: copy the whole controller folder")
+    try:
+        tensors = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise ControllerError(f"{path} is damaged or truncated: {error}") from error
+    for name, tensor in tensors.items():
+        if not torch.isfinite(tensor).all():
+            raise ControllerError(f"{path} holds numbers in {name!r} that are not finite: export the controller again")
+    return tensors

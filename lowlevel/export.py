@@ -1,0 +1,58 @@
+"""From a training run to a frozen controller folder."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lowlevel.controller import Controller, ControllerConfig, actor_sizes
+from lowlevel.environment import PilotEnvironment
+from lowlevel.networks import NetworkConfig, PilotActor
+from lowlevel.observation import FRAME, normalised_columns
+from lowlevel.provenance import git_revision
+from lowlevel.trainer import Trainer
+from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
+
+
+def controller_config(environment: PilotEnvironment, network: NetworkConfig) -> ControllerConfig:
+    """The conventions of an environment, as a controller carries them."""
+    gains = GAINS[environment.config.gains]
+    return ControllerConfig(
+        joint_names=JOINT_NAMES,
+        default_position=tuple(DEFAULT_POSITION.tolist()),
+        joint_lower=tuple(environment.simulation.joint_lower.tolist()),
+        joint_upper=tuple(environment.simulation.joint_upper.tolist()),
+        stiffness=tuple(gains.stiffness.tolist()),
+        damping=tuple(gains.damping.tolist()),
+        action_scale=tuple(gains.action_scale.tolist()),
+        action_limit=environment.config.action_limit,
+        control_period=environment.control_period,
+        command_space=environment.command_space,
+        nominal=environment.config.nominal,
+        network=network,
+        pose_axes=environment.motion.pose.axes,
+    )
+
+
+def freeze(trainer: Trainer) -> Controller:
+    """The current policy of a run as a controller on the CPU, detached from the run."""
+    config = controller_config(trainer.environment, trainer.config.network)
+    actor = PilotActor(actor_sizes(), config.network, ~normalised_columns(FRAME))
+    actor.load_state_dict({name: tensor.cpu() for name, tensor in trainer.ppo.actor.state_dict().items()})
+    provenance: dict[str, Any] = {
+        "training": asdict(trainer.config),
+        "steps": trainer.steps,
+        "hours": trainer.trained_seconds / 3600.0,
+        "curriculum": trainer.curriculum.state_dict(),
+        "revision": git_revision(),
+        "torch": torch.__version__,
+    }
+    return Controller(config, actor, trainer.environment.motion.pose, provenance)
+
+
+def export_controller(trainer: Trainer, folder: Path) -> None:
+    """Freeze the current policy of ``trainer`` into a controller ``folder``."""
+    freeze(trainer).save(folder)

@@ -1,0 +1,5 @@
+"""Lift-box: the paper's autonomous task (IV-B-2)."""
+
+from tasks.lift_box.task import LiftBox as TASK
+
+__all__ = ["TASK"]

@@ -1,0 +1,168 @@
+"""Lift-box as the planner's environment sees it: scene, episodes, observation, reward and judgement."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import mujoco
+import torch
+from torch import Tensor
+
+from highlevel.action import ActionConfig
+from highlevel.draws import uniform
+from highlevel.task import Decision, ObservationBlock, Outcome, Start, Task, rows
+from lowlevel.measures import Measurement
+from lowlevel.rotations import from_roll_pitch_yaw, multiply
+from lowlevel.simulation import BatchSimulation
+from tasks.lift_box.config import LiftBoxConfig
+from tasks.lift_box.episode import Episode, draw
+from tasks.lift_box.geometry import Situation, observe_situation, relative_pose, six_numbers
+from tasks.lift_box.reward import costs, potential
+from tasks.lift_box.scene import BOX, FORCE_SENSORS, BoxProperties, add_box_scene
+from tasks.lift_box.stages import HOLD, STAGES, Progress, advance, failure_name
+
+_NOISE_STREAM = 2
+
+
+class LiftBox(Task):
+    """Walk to a box, squeeze it between the palms, lift it, stand upright and hold it.
+
+    Args:
+        config: ranges, thresholds and weights.
+    """
+
+    name = "lift_box"
+    stages = STAGES
+    object_blocks = (
+        ObservationBlock("box_position", 3, 1.0),
+        ObservationBlock("box_rotation", 6, 1.0),
+    )
+    added_blocks = (
+        ObservationBlock("box_size", 3, 0.1),
+        ObservationBlock("palm_to_face", 6, 0.3),
+        ObservationBlock("palm_contact", 2, 1.0),
+        ObservationBlock("stage", len(STAGES), 1.0),
+        ObservationBlock("time_left", 1, 1.0),
+        ObservationBlock("best_potential", 1, 5.0),
+    )
+
+    def __init__(self, config: LiftBoxConfig | None = None) -> None:
+        self.config = LiftBoxConfig() if config is None else config
+        self.action = ActionConfig()
+        self.episode_length = self.config.episode_length
+        self.fall_penalty = self.config.rewards.fall
+
+    def describe(self) -> dict[str, Any]:
+        return asdict(self.config)
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        add_box_scene(spec)
+
+    def attach(self, simulation: BatchSimulation) -> None:
+        count = simulation.num_robots
+        self._simulation = simulation
+        self._properties = BoxProperties(simulation)
+        self.episode = Episode.empty(count)
+        self.progress = Progress.empty(count)
+        self.situation: Situation | None = None
+        self._number = rows(count)
+        self._seed = 0
+        self._control_steps = torch.zeros(count, dtype=torch.long)
+
+    # -- episodes ---------------------------------------------------------------------------------------------
+
+    def reset(self, ids: Tensor, seed: int, episode: Tensor) -> Start:
+        drawn, start = draw(self.config, seed, episode)
+        self._seed, self._number[ids] = seed, episode
+        self._control_steps[ids] = 0
+        self.episode.assign(ids, drawn)
+        self.progress.clear(ids)
+        self._properties.write(
+            rows=ids.cpu().numpy(),
+            size=drawn.size.numpy(),
+            mass=drawn.mass.numpy(),
+            center_of_mass=drawn.center_of_mass.numpy(),
+            friction=drawn.friction.numpy(),
+            support_height=drawn.support_height.numpy(),
+            hands=self.config.control != "no_hands",
+        )
+        self._simulation.update_constants(ids)
+        pose = torch.zeros(len(ids), 7)
+        pose[:, 2] = drawn.support_height + 0.5 * drawn.size[:, 2]
+        pose[:, 3] = 1.0
+        self._simulation.set_object_pose(ids, BOX, pose)
+        self.progress.start_position[ids] = pose[:, :2]
+        return start
+
+    def step(self, measured: Measurement, decision: Decision) -> Outcome:
+        rewards, stages, period = self.config.rewards, self.config.stages, self._simulation.control_period
+        self._control_steps += 1
+        situation = self.situation = self._look(measured)
+        support = self.episode.support_height
+        advance(self.progress, situation, support, stages, period)
+        success = self.progress.stage >= HOLD
+        dropped = self._dropped() & ~success
+
+        value = potential(situation, self.progress, self.episode.size, support, rewards, stages)
+        gained = (value - self.progress.best_potential).clamp_min(0.0)
+        self.progress.best_potential = torch.maximum(self.progress.best_potential, value)
+        per_decision = rewards.stream * value + costs(situation, self.progress, decision.change, rewards)
+        reward = gained + per_decision / self.action.decision_steps
+        reward = reward + rewards.success * success + rewards.drop * dropped
+        return Outcome(reward, success, dropped)
+
+    def _look(self, measured: Measurement) -> Situation:
+        # The sensor reports the force that the box exerts on the palm's side of the pair; see the tests.
+        force = torch.stack([self._simulation.sensor(name) for name in FORCE_SENSORS], dim=1)
+        return observe_situation(measured, self._simulation.object_pose(BOX), self.episode.size, force)
+
+    def _dropped(self) -> Tensor:
+        return self.progress.lost_time >= self.config.stages.drop_time
+
+    @property
+    def stage(self) -> Tensor:
+        return self.progress.stage
+
+    def failures(self, fallen: Tensor) -> list[str]:
+        columns = zip(self.progress.stage.tolist(), fallen.tolist(), self._dropped().tolist(), strict=True)
+        return [failure_name(*row) for row in columns]
+
+    # -- observation ------------------------------------------------------------------------------------------
+
+    def observe_object(self, measured: Measurement) -> Tensor:
+        robot = measured.robot
+        pelvis = torch.cat([robot.base_position, robot.base_quaternion], -1)
+        position, quaternion = relative_pose(pelvis, self._simulation.object_pose(BOX))
+        shift, turn = self._pose_noise()
+        quaternion = multiply(quaternion, from_roll_pitch_yaw(turn))
+        return torch.cat([position + shift, six_numbers(quaternion)], -1)
+
+    def observe_additions(self, measured: Measurement, time_left: Tensor) -> Tensor:
+        situation = self._look(measured)
+        current = self.progress.stage.clamp(max=len(STAGES) - 1)
+        return torch.cat(
+            [
+                self.episode.size,
+                (situation.palm_offset + self._pose_noise()[0][:, None]).flatten(1),
+                self.progress.touching.float(),
+                torch.nn.functional.one_hot(current, len(STAGES)).float(),
+                time_left[:, None],
+                self.progress.best_potential[:, None],
+            ],
+            dim=-1,
+        )
+
+    def _pose_noise(self) -> tuple[Tensor, Tensor]:
+        """Errors of the observed box position [m] and attitude [rad], each (N, 3); new at every decision."""
+        noise = self.config.noise
+        moment = self._number * 100_000 + self._control_steps
+        fresh = 2.0 * uniform(self._seed, moment, _NOISE_STREAM, 6) - 1.0
+        shift = 0.5 * noise.position * (fresh[:, :3] + self.episode.position_bias)
+        turn = 0.5 * noise.angle * (fresh[:, 3:] + self.episode.angle_bias)
+        return shift, turn
+
+    def expert(self, environment: Any) -> Any:
+        from tasks.lift_box.expert import LiftBoxExpert
+
+        return LiftBoxExpert(environment, self)

@@ -1,0 +1,44 @@
+"""Fixtures that several folders share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from lowlevel.commands import command_space
+from lowlevel.controller import Controller, ControllerConfig, actor_sizes
+from lowlevel.networks import NetworkConfig, PilotActor
+from lowlevel.nominal import NominalConfig
+from lowlevel.observation import FRAME, normalised_columns
+from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
+from robots.g1.model import build_spec, joint_limits
+from robots.g1.nominal_pose import NominalPose
+
+
+@pytest.fixture(scope="session")
+def untrained_controller(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a controller with random weights: it falls, but everything around it can be exercised."""
+    torch.manual_seed(0)
+    gains, limits = GAINS["stiff"], joint_limits(build_spec().compile())
+    pose, network = NominalPose.load(), NetworkConfig()
+    config = ControllerConfig(
+        joint_names=JOINT_NAMES,
+        default_position=tuple(DEFAULT_POSITION.tolist()),
+        joint_lower=tuple(limits[:, 0].tolist()),
+        joint_upper=tuple(limits[:, 1].tolist()),
+        stiffness=tuple(gains.stiffness.tolist()),
+        damping=tuple(gains.damping.tolist()),
+        action_scale=tuple(gains.action_scale.tolist()),
+        action_limit=8.0,
+        control_period=0.02,
+        command_space=command_space(limits[:, 0].tolist(), limits[:, 1].tolist()),
+        nominal=NominalConfig(),
+        network=network,
+        pose_axes=pose.axes,
+    )
+    actor = PilotActor(actor_sizes(), network, ~normalised_columns(FRAME))
+    folder = tmp_path_factory.mktemp("controllers") / "untrained"
+    Controller(config, actor, pose, provenance={}).save(folder)
+    return folder

@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from evaluation.harness import Arena, Episode, Moment, Push, batch_steps, constant, episode_seeds, run_all
+from lowlevel.commands import HEIGHT, VELOCITY
+from lowlevel.controller import Controller
+from lowlevel.observation import NoiseConfig
+from lowlevel.terrain import TerrainConfig
+from robots.g1.constants import FOOT_BODIES
+
+FLAT = TerrainConfig(tile_size=16.0)
+QUIET = NoiseConfig(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def controller(untrained_controller: Path) -> Controller:
+    return Controller.load(untrained_controller)
+
+
+@pytest.fixture(scope="module")
+def arena(controller: Controller) -> Arena:
+    return Arena(controller, FLAT, num_threads=1, batch=4)
+
+
+def standing(controller: Controller, count: int, duration: float = 0.2) -> list[Episode]:
+    command = controller.config.command_space.neutral()
+    return [constant(episode_seeds(0, index)[1], duration, command, flag=1.0) for index in range(count)]
+
+
+def joints(arena: Arena, episodes: Sequence[Episode]) -> torch.Tensor:
+    """Joint positions over time (T, episodes, 29)."""
+    count = len(episodes)
+    return torch.stack([moment.measured.robot.joint_position[:count] for moment in arena.run(episodes)])
+
+
+def test_robots_start_standing_at_the_commanded_height(arena: Arena, controller: Controller) -> None:
+    first = next(arena.run(standing(controller, 4)))
+    np.testing.assert_allclose(first.measured.base_height, 0.765, atol=0.01)
+    assert (first.measured.projected_gravity[:, 2] < -0.9).all()
+    upright = first.measured.torso_orientation[:, 0].abs()
+    assert (upright > 0.999).all()
+    assert first.since_change.tolist() == pytest.approx([0.02] * 4)
+
+
+def test_an_episode_repeats_exactly_and_does_not_depend_on_its_company(
+    arena: Arena, controller: Controller
+) -> None:
+    episodes = standing(controller, 4)
+    together = joints(arena, episodes)
+    assert torch.equal(together, joints(arena, episodes))
+    assert torch.equal(together[:, :2], joints(arena, episodes[:2]))
+    longer = [replace(episode, duration=0.3) for episode in episodes]
+    assert torch.equal(together, joints(arena, longer)[: len(together)])
+    assert not torch.equal(together[:, 0], together[:, 1])
+
+
+def test_batch_size_changes_no_more_than_rounding(controller: Controller) -> None:
+    episodes = standing(controller, 5)
+    results = []
+    for batch in (2, 5):
+        arena = Arena(controller, FLAT, num_threads=1, batch=batch)
+        final = torch.zeros(5, 29)
+
+        def observe(first: int, group: Sequence[Episode], final: torch.Tensor = final):  # noqa: ANN202
+            def see(moment: Moment) -> None:
+                final[first : first + len(group)] = moment.measured.robot.joint_position[: len(group)]
+
+            return see
+
+        run_all(arena, episodes, observe)
+        results.append(final)
+    np.testing.assert_allclose(results[0], results[1], atol=1e-4)
+
+
+def test_friction_is_drawn_per_episode_and_decided_by_the_feet(arena: Arena, controller: Controller) -> None:
+    episodes = standing(controller, 4)
+    for _ in arena.run(episodes):
+        pass
+    drawn = arena.friction
+    assert ((drawn >= 0.6) & (drawn <= 1.0)).all() and len(drawn.unique()) == 4
+    model, data = arena.simulation.robot_model(2), arena.simulation.robot_data(2)
+    mujoco.mj_forward(model, data)
+    feet = {model.body(name).id for name in FOOT_BODIES}
+    touching = [c for c in data.contact if {model.geom_bodyid[g] for g in c.geom} & feet]
+    assert touching
+    for contact in touching:
+        assert contact.friction[0] == pytest.approx(drawn[2].item(), abs=1e-6)
+
+
+def test_commands_switch_on_time_and_are_clamped(arena: Arena, controller: Controller) -> None:
+    neutral = controller.config.command_space.neutral()
+    impossible = neutral.clone()
+    impossible[HEIGHT], impossible[5] = 0.30, 1.5
+    episode = Episode(1, 0.2, (0.0, 0.1), torch.stack([neutral, impossible]), torch.tensor([1.0, 0.0]))
+    moments = list(arena.run([episode]))
+    assert len(moments) == 10
+    switched = [moment.command[0, HEIGHT].item() < 0.5 for moment in moments]
+    assert switched == [False] * 5 + [True] * 5
+    assert [moment.flag[0, 0].item() for moment in moments] == [1.0] * 5 + [0.0] * 5
+    assert moments[5].since_change[0].item() == pytest.approx(0.02)
+    clamped = controller.clamp_command(impossible[None])[0]
+    assert clamped[5] < 1.4
+    torch.testing.assert_close(moments[-1].command[0], clamped)
+
+
+def test_a_push_changes_the_velocity_of_its_robot_only(controller: Controller) -> None:
+    arena = Arena(controller, FLAT, QUIET, num_threads=1, batch=4)
+    pushed, left_alone = standing(controller, 2)
+    pushed = replace(pushed, pushes=(Push(0.1, (0.8, 0.0, 0.0)),))
+    before, after = (
+        list(arena.run([episode, left_alone]))[5].measured.robot.base_linear_velocity
+        for episode in (replace(pushed, pushes=()), pushed)
+    )
+    change = after - before
+    assert 0.3 < change[0, 0] < 0.9 and change[0, 1].abs() < 0.2
+    assert change[1].abs().max() == 0.0
+
+
+def test_a_fall_ends_its_episode_only(arena: Arena, controller: Controller) -> None:
+    hit, spared = standing(controller, 2, duration=0.4)
+    hit = replace(hit, pushes=(Push(0.0, (0.0, 12.0, 0.0)),))
+    moments = list(arena.run([hit, spared]))
+    fell = torch.stack([moment.fell for moment in moments])
+    active = torch.stack([moment.active for moment in moments])
+    assert fell.sum(dim=0).tolist()[:2] == [1, 0]
+    when = int(fell[:, 0].nonzero()[0])
+    assert active[: when + 1, 0].all() and not active[when + 1 :, 0].any()
+    assert active[:, 1].all() and len(moments) == 20
+    assert not active[:, 2:].any()
+
+
+def test_noise_reaches_what_the_controller_sees_but_not_what_is_measured(controller: Controller) -> None:
+    episodes = standing(controller, 1)
+    noisy = Arena(controller, FLAT, num_threads=1, batch=1)
+    quiet = Arena(controller, FLAT, QUIET, num_threads=1, batch=1)
+    seen = [next(arena.run(episodes)) for arena in (noisy, quiet)]
+    spread = seen[0].elevation - seen[1].elevation
+    assert 0.015 < spread.abs().max() <= 0.02
+    expected = seen[1].measured.robot.base_position[:, 2:3].expand(-1, 121)
+    torch.testing.assert_close(seen[1].elevation, expected, atol=0.01, rtol=0.0)
+    assert not torch.equal(seen[0].measured.robot.joint_velocity, seen[1].measured.robot.joint_velocity)
+
+
+def test_steps_are_counted_by_batches(arena: Arena, controller: Controller) -> None:
+    episodes = standing(controller, 6)
+    passed: list[int] = []
+    run_all(arena, episodes, lambda first, batch: lambda moment: None, passed.append)
+    assert sum(passed) == batch_steps(arena, episodes) == 20
+
+
+def test_a_controller_with_other_gains_is_refused(untrained_controller: Path) -> None:
+    controller = Controller.load(untrained_controller)
+    controller.gains = replace(controller.gains, stiffness=2.0 * controller.gains.stiffness)
+    with pytest.raises(ValueError, match="none of the sets that can be simulated"):
+        Arena(controller, FLAT)
+
+
+def test_seeds_of_different_episodes_differ() -> None:
+    seeds = {seed for index in range(50) for seed in episode_seeds(3, index)}
+    assert len(seeds) == 100
+    assert episode_seeds(3, 0) != episode_seeds(4, 0)
+
+
+def test_forward_means_forward_in_the_heading_frame(controller: Controller) -> None:
+    """A push along the robot's own heading shows up as vx, whatever the heading."""
+    arena = Arena(controller, FLAT, QUIET, num_threads=1, batch=1)
+    (episode,) = standing(controller, 1)
+    heading = next(arena.run([episode])).measured.heading[0].item()
+    along = (float(np.cos(heading)), float(np.sin(heading)), 0.0)
+    moments = list(arena.run([replace(episode, pushes=(Push(0.0, along),))]))
+    velocity = moments[0].measured.linear_velocity[0]
+    assert velocity[0] > 0.5 and velocity[1].abs() < 0.15
+    assert moments[0].command[0, VELOCITY].abs().max() == 0.0
