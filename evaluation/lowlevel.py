@@ -118,6 +118,7 @@ def _run(arguments: Arguments) -> None:
     controller = Controller.load(arguments.controller)
     # Small matrix products only lose time to waking threads, and the physics wants the cores.
     torch.set_num_threads(1)
+    print(f"evaluating {arguments.controller} on the {arguments.suite} suite", flush=True)
     evaluation = evaluate(controller, content_hash(arguments.controller), arguments)
     write_results(arguments.output, lambda folder: write_report(folder, evaluation))
     if arguments.write_metrics:
@@ -254,8 +255,8 @@ def report_text(evaluation: Evaluation) -> str:
             "",
             f"Commanded to walk at {WALK_SPEED} m/s for {WALK_TIME:.0f} s, a share of "
             f"{format_figure(survival)} of {survival.n} episodes does not fall; the mean forward speed is "
-            f"{format_figure(speed)} m/s. A share of {format_figure(figures['walk_half_mps_success'])} neither "
-            "falls nor stays below half the commanded speed.",
+            f"{format_figure(speed)} m/s. A share of {format_figure(figures['walk_half_mps_success'])} "
+            "neither falls nor stays below half the commanded speed.",
             "",
             "## Experts",
             "",

@@ -250,7 +250,8 @@ class Learner:
         low, high = self.config.std_bounds
         with torch.no_grad():
             self.actor.log_std.clamp_(math.log(low), math.log(high))
-        self.target_encoder.renormalise_prototypes()
+        if "estimator" in groups:
+            self.target_encoder.renormalise_prototypes()
         return {**result, "learning_rate": rate}
 
     def state_dict(self) -> dict[str, Any]:

@@ -79,7 +79,7 @@ class MapEncoder(nn.Module):
 
     def tokens(self, elevation_map: Tensor) -> tuple[Tensor, Tensor]:
         """Local features of every cell: shared-MLP features (N, C, M), and height, x, y (N, 3, M)."""
-        samples = len(elevation_map)
+        samples = elevation_map.shape[0]
         pooled = (elevation_map @ self.pooling).unflatten(1, (self.windows, -1))
         weight = self.shared.weight.expand(samples, -1, -1)
         features = functional.elu(torch.baddbmm(self.shared.bias[:, None], weight, pooled))

@@ -168,7 +168,7 @@ class PilotActor(nn.Module):
         if self.config.vision:
             perception = self.map_encoder(self._heights(elevation_map), current)
         else:
-            perception = current.new_zeros(len(current), self.perception_size)
+            perception = current.new_zeros(current.shape[0], self.perception_size)
         return self.head(torch.cat([perception, latent.detach(), velocity.detach(), current, flag], dim=1))
 
     def forward(self, history: Tensor, elevation_map: Tensor, flag: Tensor) -> ActorOutput:

@@ -156,7 +156,7 @@ def _add_palms(spec: mujoco.MjSpec, options: ModelOptions) -> None:
         body.add_site(name=f"{side}_palm", pos=[PALM_OFFSET[0], inwards * 0.012, PALM_OFFSET[2]])
         parts = (
             ("palm", [PALM_OFFSET[0], 0.0, 0.0], [0.05, 0.012, 0.045]),
-            ("wrist", [0.02, 0.0, 0.0], [0.03, 0.025, 0.025]),
+            ("wrist", [0.02, 0.0, 0.0], [0.03, 0.012, 0.025]),
         )
         for part, position, half_size in parts:
             box = body.add_geom(name=f"{side}_{part}", type=mujoco.mjtGeom.mjGEOM_BOX)

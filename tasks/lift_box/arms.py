@@ -29,6 +29,8 @@ class PalmPose:
     """(N, 2, 3, 3)"""
     jacobian: Tensor
     """By the 7 arm joints (N, 2, 6, 7): velocity of the centre, then angular velocity, in the frame of ``position``."""
+    shoulder: Tensor
+    """First joint of each arm (N, 2, 3) [m]."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class InverseConfig:
     rest_weight: float = 0.05
     """On leaving the rest posture: what the seventh joint does with its freedom."""
     iterations: int = 10
-    largest_step: float = 0.3
+    largest_step: float = 0.2
     """Per iteration and joint [rad]."""
     limit_margin: float = 0.03
     """Kept from every joint limit [rad]."""
@@ -98,7 +100,7 @@ class ArmKinematics:
         palm = position + (rotation @ self._palms[:, :, None])[..., 0]
         axis, origin = torch.stack(directions, -1), torch.stack(origins, -1)
         linear = torch.linalg.cross(axis, palm[..., None] - origin, dim=-2)
-        return PalmPose(palm, rotation, torch.cat([linear, axis], dim=-2))
+        return PalmPose(palm, rotation, torch.cat([linear, axis], dim=-2), origins[0])
 
     def inverse(
         self, waist: Tensor, start: Tensor, rest: Tensor, position: Tensor, rotation: Tensor
@@ -141,17 +143,18 @@ class ArmKinematics:
         return joints, (self.forward(waist, joints).position - position).norm(dim=-1)
 
 
-def palm_rotation(forward: Tensor, finger_pitch: Tensor) -> Tensor:
-    """Palm axes (N, 2, 3, 3) for fingers along ``forward`` (N, 3), a horizontal unit vector, pitched down.
+def palm_rotation(forward: Tensor, finger_pitch: float, toe_in: float = 0.0) -> Tensor:
+    """Axes (N, 2, 3, 3) of palms that face each other, with the fingers along ``forward`` (N, 3), pitched down.
 
-    ``finger_pitch`` (N,) [rad] turns the fingers down about the left-pointing axis. The palms face each other.
+    ``forward`` is a horizontal unit vector; ``finger_pitch`` [rad] turns the fingers down, and ``toe_in`` [rad]
+    turns each hand about its thumb axis so that the fingers point at each other.
     """
     up = torch.zeros_like(forward)
     up[:, 2] = 1.0
     left = torch.linalg.cross(up, forward)
-    cosine, sine = torch.cos(finger_pitch)[:, None], torch.sin(finger_pitch)[:, None]
-    axes = torch.stack([cosine * forward - sine * up, left, sine * forward + cosine * up], dim=-1)
-    return axes[:, None].expand(-1, 2, -1, -1)
+    world = torch.stack([forward, left, up], dim=-1)
+    turns = [pin.rpy.rpyToMatrix(0.0, finger_pitch, 0.0) @ pin.rpy.rpyToMatrix(0.0, 0.0, s * toe_in) for s in (-1.0, 1.0)]
+    return world[:, None] @ torch.tensor(np.array(turns), dtype=torch.float32)
 
 
 def quaternion_of(rotation: Tensor) -> Tensor:

@@ -15,8 +15,8 @@ from tasks.lift_box.stages import APPROACH, GRASP, REACH, Progress
 
 STAND_OFF = 0.30
 """Distance of the near face ahead of the pelvis that the approach aims at [m]."""
-SHOULDER_ABOVE_PALMS = 0.36
-"""Height of the shoulders above the palms in a comfortable grasp [m]."""
+PALM_BELOW_TOP = 0.07
+"""Where the palms go, below the top edge [m]: any lower and the forearms touch the faces before the palms do."""
 
 
 def grasp_posture(palm_height: Tensor) -> tuple[Tensor, Tensor]:
@@ -45,7 +45,7 @@ def potential(
     approach = torch.exp(-2.0 * away) * torch.exp(-situation.yaw_error.abs())
     approach = torch.where(stage >= APPROACH, 1.0, approach)
 
-    height, pitch = grasp_posture(support_height + 0.6 * size[:, 2])
+    height, pitch = grasp_posture(support_height + size[:, 2] - PALM_BELOW_TOP)
     posture = torch.exp(
         -(((situation.base_height - height) / 0.15) ** 2) - ((situation.torso_pitch - pitch) / 0.5) ** 2
     )

@@ -10,14 +10,14 @@ import mujoco
 import numpy as np
 
 from lowlevel.simulation import BatchSimulation
-from robots.g1.constants import SIDES, TORSO_BODY
+from robots.g1.constants import HAND_BODIES, SIDES, TORSO_BODY
 from robots.g1.model import PALM_COLLISION, WORLD_COLLISION
 
 BOX = "box"
 SUPPORT = "support"
 HAND_GEOMS = tuple(f"{side}_{part}" for side in SIDES for part in ("palm", "wrist"))
-FORCE_SENSORS = tuple(f"{side}_palm_box_force" for side in SIDES)
-"""Net contact force that each palm exerts on the box, world frame."""
+FORCE_SENSORS = tuple(f"{side}_hand_box_force" for side in SIDES)
+"""Net contact force that each hand, palm and wrist together, exerts on the box, world frame."""
 
 NOMINAL_EDGE, NOMINAL_MASS = 0.30, 1.0
 _BURIED = 0.05
@@ -51,9 +51,9 @@ def add_box_scene(spec: mujoco.MjSpec) -> None:
     for part in _BLOCKERS:
         # Without friction: the rest of the body may be in the way of the box, but only the palms may carry it.
         spec.add_pair(geomname1=part, geomname2=BOX, condim=1)
-    for side, name in zip(SIDES, FORCE_SENSORS, strict=True):
+    for hand, name in zip(HAND_BODIES, FORCE_SENSORS, strict=True):
         sensor = spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT)
-        sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, f"{side}_palm"
+        sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_BODY, hand
         sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_GEOM, BOX
         # fields: force only; reduction: net force, expressed in the world frame
         sensor.intprm = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1]

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,13 +63,15 @@ def test_an_episode_repeats_exactly_and_does_not_depend_on_its_company(
 
 
 def test_batch_size_changes_no_more_than_rounding(controller: Controller) -> None:
-    episodes = standing(controller, 5)
+    episodes = standing(controller, 5, duration=0.1)
     results = []
     for batch in (2, 5):
         arena = Arena(controller, FLAT, num_threads=1, batch=batch)
         final = torch.zeros(5, 29)
 
-        def observe(first: int, group: Sequence[Episode], final: torch.Tensor = final):  # noqa: ANN202
+        def observe(
+            first: int, group: Sequence[Episode], final: torch.Tensor = final
+        ) -> Callable[[Moment], None]:
             def see(moment: Moment) -> None:
                 final[first : first + len(group)] = moment.measured.robot.joint_position[: len(group)]
 
@@ -150,10 +152,10 @@ def test_noise_reaches_what_the_controller_sees_but_not_what_is_measured(control
 
 
 def test_steps_are_counted_by_batches(arena: Arena, controller: Controller) -> None:
-    episodes = standing(controller, 6)
+    episodes = standing(controller, 6, duration=0.1)
     passed: list[int] = []
     run_all(arena, episodes, lambda first, batch: lambda moment: None, passed.append)
-    assert sum(passed) == batch_steps(arena, episodes) == 20
+    assert sum(passed) == batch_steps(arena, episodes) == 10
 
 
 def test_a_controller_with_other_gains_is_refused(untrained_controller: Path) -> None:

@@ -1,0 +1,356 @@
+"""A scripted expert: a state machine per robot, run for all robots at once, that produces planner actions.
+
+It shows that the controller can do the task before anything is learnt, gives the demonstrations, and is the
+baseline. It sees the true state, including contact forces. The numbers follow OmniContact's reference generator
+and DemoHLM's three segments (walk, reach in the object's frame, lift in the robot's frame).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from highlevel.environment import CommandEnvironment
+from highlevel.task import rows
+from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, TORSO, VELOCITY
+from lowlevel.measures import Measurement
+from lowlevel.rotations import rotate, rotate_about_vertical, rotate_inverse, yaw_of
+from robots.g1.constants import ARM_JOINTS, WAIST_JOINTS
+from tasks.lift_box.arms import ArmKinematics, palm_rotation
+from tasks.lift_box.geometry import Situation
+from tasks.lift_box.reward import PALM_BELOW_TOP, grasp_posture
+from tasks.lift_box.scene import BOX
+from tasks.lift_box.task import LiftBox
+
+WALK, STOP, DESCEND, CLOSE, LIFT, HOLD = range(6)
+PHASES = ("walk", "stop", "descend", "close", "lift", "hold")
+
+
+@dataclass(frozen=True)
+class ExpertConfig:
+    """How the expert moves."""
+
+    stand_off: float = 0.27
+    """Near face ahead of the feet when the walk ends [m]: clear of the knees of a deep squat."""
+    gate_distance: float = 0.70
+    """Near face ahead of the feet at the gate in front of the box, where it lines up [m]."""
+    gate_lateral: float = 0.15
+    """Lateral error beyond which it goes to the gate before it goes to the box [m]."""
+    position_gain: float = 1.2
+    """[1/s]"""
+    yaw_gain: float = 1.6
+    """[1/s]"""
+    slowest: float = 0.14
+    """Least speed while walking [m/s]: the controller ignores slower commands."""
+    position_tolerance: float = 0.04
+    """[m]"""
+    yaw_tolerance: float = 0.09
+    """[rad]"""
+    loose: float = 2.0
+    """Tolerances grow by this factor once it stands, before it walks again."""
+    settle_time: float = 0.5
+    """Standing time before the descent [s]."""
+    descend_time: float = 2.0
+    """[s]"""
+    clearance: float = 0.07
+    """Of each palm from its face before the grasp [m]."""
+    palm_ahead: float = 0.0
+    """Of the palms from the middle of the side faces [m]."""
+    finger_pitch: float = 0.85
+    """Fingers point down by this much [rad]."""
+    toe_in: float = 0.12
+    """Fingers point at each other by this much, so that forearms stay clear of the faces [rad]."""
+    wide: float = 0.06
+    """Extra clearance of each palm while the body descends [m]."""
+    reach_length: float = 0.42
+    """Largest distance of a palm from its shoulder while the body descends [m]."""
+    ready_tolerance: float = 0.06
+    """Of the palms from their pre-grasp places before they close [m]."""
+    close_speed: float = 0.12
+    """Of each palm towards its face [m/s]."""
+    force: float = 25.0
+    """Wanted normal force per palm [N]."""
+    force_gain: float = 0.0010
+    """Squeeze depth per force error and decision [m/N]."""
+    deepest: float = 0.08
+    """Largest squeeze depth [m]."""
+    grasp_time: float = 0.5
+    """Time with both palms loaded before the lift [s]."""
+    lift_time: float = 2.6
+    """[s]"""
+    carry_ahead: float = 0.33
+    """Of the palms from the feet when upright [m]."""
+    carry_height: float = 0.74
+    """Least height of the palms when upright [m]."""
+    carry_clearance: float = 0.38
+    """Least bottom of the box above its support when upright [m]."""
+    stand_height: float = 0.75
+    """[m]"""
+    correction_gain: float = 0.25
+    """Share of the palms' position error that is added to the correction at every decision."""
+    largest_correction: float = 0.08
+    """[m]"""
+
+
+@dataclass
+class _Memory:
+    """State of N state machines."""
+
+    phase: Tensor
+    time: Tensor
+    """Since the phase began (N,) [s]."""
+    descent: Tensor
+    """0 upright, 1 in the grasp posture (N,)."""
+    depth: Tensor
+    """Palms inside their faces, negative outside (N,) [m]."""
+    correction: Tensor
+    """Added to the palms' targets (N, 2, 3) [m], world axes."""
+    grasp_point: Tensor
+    """Middle between the palms when the lift began (N, 3) [m], world frame."""
+    grasp_yaw: Tensor
+    """Yaw of the box when the lift began (N,) [rad]."""
+    loaded_time: Tensor
+    """(N,) [s]"""
+    arms: Tensor
+    """Last solution of the inverse kinematics (N, 14) [rad]."""
+
+
+class LiftBoxExpert:
+    """Scripted expert for the robots of one environment.
+
+    Args:
+        environment: whose robots it controls.
+        task: that environment's task.
+        config: how it moves.
+    """
+
+    def __init__(self, environment: CommandEnvironment, task: LiftBox, config: ExpertConfig | None = None) -> None:
+        self.config = ExpertConfig() if config is None else config
+        self._environment, self._task = environment, task
+        self._period = environment.decision_period
+        self._arms = ArmKinematics()
+        self._neutral = environment.controller.config.command_space.neutral()
+        count = environment.num_envs
+        self._memory = _Memory(
+            phase=torch.zeros(count, dtype=torch.long),
+            time=torch.zeros(count),
+            descent=torch.zeros(count),
+            depth=torch.zeros(count),
+            correction=torch.zeros(count, 2, 3),
+            grasp_point=torch.zeros(count, 3),
+            grasp_yaw=torch.zeros(count),
+            loaded_time=torch.zeros(count),
+            arms=torch.zeros(count, 14),
+        )
+        self.reset(rows(count))
+
+    @property
+    def phase(self) -> Tensor:
+        """Current phase of each robot (N,), an index into :data:`PHASES`."""
+        return self._memory.phase
+
+    def reset(self, ids: Tensor) -> None:
+        """Begin new episodes in rows ``ids``."""
+        memory = self._memory
+        for values in (memory.phase, memory.time, memory.descent, memory.correction, memory.loaded_time):
+            values[ids] = 0
+        memory.depth[ids] = -self.config.clearance
+        memory.arms[ids] = self._neutral[ARMS]
+
+    @torch.no_grad()
+    def act(self) -> Tensor:
+        """The next action (N, 21)."""
+        measured = self._environment.measured
+        if measured is None:
+            raise RuntimeError("reset the environment before asking the expert")
+        situation = self._task._look(measured)
+        self._advance(measured, situation)
+        command = self._neutral.repeat(len(self.phase), 1)
+        command[:, VELOCITY] = self._velocity(measured, situation)
+        height, pitch = self._posture()
+        command[:, HEIGHT] = height
+        command[:, TORSO.start + 1] = pitch
+        command[:, ARMS] = self._arm_targets(measured, situation)
+        return self._environment.action_map.action(command)
+
+    # -- state machine ----------------------------------------------------------------------------------------
+
+    def _advance(self, measured: Measurement, situation: Situation) -> None:
+        config, memory, period = self.config, self._memory, self._period
+        phase = memory.phase
+        position_error, yaw_error = self._stand_error(measured, situation)
+        off = position_error.norm(dim=-1) / config.position_tolerance
+        off = torch.maximum(off, yaw_error.abs() / config.yaw_tolerance)
+        memory.time = memory.time + period
+        loaded = (situation.palm_force > 0.6 * config.force).all(dim=1)
+        memory.loaded_time = torch.where(loaded & (phase == CLOSE), memory.loaded_time + period, 0.0)
+        ready = situation.palm_distance.amax(dim=1) < config.clearance + config.ready_tolerance
+
+        following = phase.clone()
+        following[(phase == WALK) & (off < 1.0)] = STOP
+        stopped = (phase == STOP) & (memory.time > config.settle_time) & (situation.speed < 0.15)
+        following[stopped & (off < config.loose)] = DESCEND
+        following[(phase == STOP) & (off >= config.loose)] = WALK
+        down = (phase == DESCEND) & (memory.descent >= 1.0)
+        following[down & (ready | (memory.time > config.descend_time + 2.0))] = CLOSE
+        grasped = (phase == CLOSE) & ((memory.loaded_time > config.grasp_time) | (memory.time > 4.0))
+        following[grasped] = LIFT
+        following[(phase == LIFT) & (memory.descent <= 0.0)] = HOLD
+        changed = following != phase
+        memory.time = torch.where(changed, 0.0, memory.time)
+        memory.phase = following
+
+        midpoint = measured.robot.palm_position.mean(dim=1)
+        memory.grasp_point = torch.where(grasped[:, None], midpoint, memory.grasp_point)
+        memory.grasp_yaw = torch.where(grasped, yaw_of(situation.box_pose[:, 3:]), memory.grasp_yaw)
+
+        down_step, up_step = period / config.descend_time, period / config.lift_time
+        change = torch.where(
+            following == DESCEND, down_step, torch.where(following == LIFT, -up_step, torch.zeros_like(memory.descent))
+        )
+        memory.descent = (memory.descent + change).clamp(0.0, 1.0)
+        closing = (following == CLOSE).float() * config.close_speed * period
+        pushing = (situation.palm_force > 3.0).all(dim=1) | (following >= LIFT)
+        by_force = config.force_gain * (config.force - situation.palm_force.amin(dim=1))
+        step = torch.where(pushing, by_force.clamp(-0.01, 0.01), closing)
+        step = torch.where(following >= CLOSE, step, torch.zeros_like(step))
+        memory.depth = (memory.depth + step).clamp(-config.clearance, config.deepest)
+
+    # -- legs -------------------------------------------------------------------------------------------------
+
+    def _stand_error(self, measured: Measurement, situation: Situation) -> tuple[Tensor, Tensor]:
+        """Where to stand from the feet: position (N, 2) [m] in the heading frame, and yaw (N,) [rad]."""
+        box_yaw = situation.yaw_error
+        back = rotate_about_vertical(box_yaw, torch.tensor([-self.config.stand_off, 0.0]).expand(len(box_yaw), 2))
+        return self._near_face_from_feet(measured, situation) + back, box_yaw
+
+    def _near_face_from_feet(self, measured: Measurement, situation: Situation) -> Tensor:
+        robot = measured.robot
+        # The foot sites lie 3.5 cm ahead of the ankles.
+        feet = robot.foot_position.mean(dim=1) - robot.base_position
+        feet = rotate_about_vertical(-measured.heading, feet)[:, :2] - torch.tensor([0.035, 0.0])
+        return situation.near_face[:, :2] - feet
+
+    def _velocity(self, measured: Measurement, situation: Situation) -> Tensor:
+        """Velocity command (N, 3) towards the stand-off, by way of the gate when it is off to the side."""
+        config = self.config
+        error, yaw_error = self._stand_error(measured, situation)
+        in_box_frame = rotate_about_vertical(-yaw_error, error)
+        extra = config.gate_distance - config.stand_off
+        aside = (in_box_frame[:, 1].abs() > config.gate_lateral) | (yaw_error.abs() > 0.5)
+        gate = torch.stack([-extra * torch.ones_like(yaw_error), torch.zeros_like(yaw_error)], -1)
+        to_gate = error + rotate_about_vertical(yaw_error, gate)
+        target = torch.where(aside[:, None], to_gate, error)
+        distance = target.norm(dim=-1, keepdim=True)
+        speed = (config.position_gain * distance).clamp(max=1.0)
+        velocity = target / distance.clamp_min(1e-6) * speed
+        # Far away it faces where it goes, near the box it faces the box.
+        bearing = torch.atan2(target[:, 1], target[:, 0])
+        turn = torch.where(distance[:, 0] > 0.8, bearing, yaw_error)
+        upper = self._environment.action_map.upper[VELOCITY]
+        lower = self._environment.action_map.lower[VELOCITY]
+        facing = torch.cos(bearing).clamp_min(0.0)
+        slow_down = torch.where(distance[:, 0] > 0.8, facing, 1.0)
+        command = torch.cat([velocity * slow_down[:, None], (config.yaw_gain * turn)[:, None]], -1)
+        command = torch.maximum(torch.minimum(command, upper), lower)
+        norm = command.norm(dim=-1, keepdim=True)
+        command = command * (config.slowest / norm.clamp_min(1e-6)).clamp_min(1.0)
+        return command * (self.phase == WALK)[:, None]
+
+    def _posture(self) -> tuple[Tensor, Tensor]:
+        """Base height and torso pitch (N,)."""
+        episode, memory = self._task.episode, self._memory
+        low, bent = grasp_posture(episode.support_height + episode.size[:, 2] - PALM_BELOW_TOP)
+        share = _smooth(memory.descent)
+        height = self.config.stand_height + share * (low - self.config.stand_height)
+        height = torch.where(memory.phase <= STOP, self._neutral[HEIGHT], height)
+        return height, share * bent
+
+    # -- arms -------------------------------------------------------------------------------------------------
+
+    def _arm_targets(self, measured: Measurement, situation: Situation) -> Tensor:
+        """Arm joints (N, 14) that put the palms where the phase wants them, given the torso as it is."""
+        config, memory, episode, robot = self.config, self._memory, self._task.episode, measured.robot
+        box = situation.box_pose
+        box_yaw = yaw_of(box[:, 3:])
+        lifting = memory.phase >= LIFT
+        yaw = torch.where(lifting, memory.grasp_yaw, box_yaw)
+        forward = torch.stack([torch.cos(yaw), torch.sin(yaw), torch.zeros_like(yaw)], -1)
+        left = torch.stack([-forward[:, 1], forward[:, 0], forward[:, 2]], -1)
+
+        at_box = box[:, :3] + config.palm_ahead * forward
+        at_box[:, 2] = episode.support_height + episode.size[:, 2] - PALM_BELOW_TOP
+        feet = robot.foot_position.mean(dim=1)
+        carry = feet + (config.carry_ahead - 0.035) * forward
+        carry_height = episode.support_height + config.carry_clearance + episode.size[:, 2] - PALM_BELOW_TOP
+        carry[:, 2] = carry_height.clamp_min(config.carry_height)
+        # Up first, then back: the box must clear the knees.
+        rise = _smooth(1.0 - memory.descent)
+        back = _smooth((1.5 * (1.0 - memory.descent) - 0.5).clamp(0.0, 1.0))
+        share = torch.stack([back, back, rise], -1)
+        path = memory.grasp_point + share * (carry - memory.grasp_point)
+        middle = torch.where(lifting[:, None], path, at_box)
+
+        wide = config.wide * _smooth((4.0 * (1.0 - memory.descent)).clamp(0.0, 1.0)) * ~lifting
+        apart = 0.5 * episode.size[:, 1] - memory.depth + wide
+        side = torch.tensor([1.0, -1.0])
+        # The kinematic palm centre lies inside the hand, 1.2 cm behind the surface that touches.
+        offset = side[None, :, None] * (apart + 0.012)[:, None, None] * left[:, None]
+        target = middle[:, None] + offset
+        target = self._within_reach(target, measured)
+        error = middle[:, None] + side[None, :, None] * apart[:, None, None] * left[:, None] - robot.palm_position
+        self._correct(error)
+
+        pelvis_frame = robot.base_quaternion[:, None].expand(-1, 2, -1)
+        position = rotate_inverse(pelvis_frame, target + memory.correction - robot.base_position[:, None])
+        axes = palm_rotation(forward, config.finger_pitch, config.toe_in)
+        columns = axes.transpose(-1, -2)
+        in_pelvis = rotate_inverse(robot.base_quaternion[:, None, None].expand(-1, 2, 3, -1), columns)
+        rest = self._rest_posture(situation.torso_pitch)
+        waist = robot.joint_position[:, WAIST_JOINTS]
+        solution, _ = self._arms.inverse(waist, memory.arms, rest, position, in_pelvis.transpose(-1, -2))
+        at_work = memory.phase >= DESCEND
+        ready = self._neutral[ARMS].expand_as(solution)
+        memory.arms = torch.where(at_work[:, None], solution, self._rest_posture(situation.torso_pitch))
+        return torch.where(at_work[:, None], solution, ready)
+
+    def _rest_posture(self, torso_pitch: Tensor) -> Tensor:
+        """Arms hanging ahead of the torso (N, 14), hands half open to the box."""
+        left = torch.tensor([-0.2, 0.2, 0.15, 0.5, -0.1, 0.2, 0.0])
+        sign = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+        rest = torch.cat([left, left * sign]).repeat(len(torso_pitch), 1)
+        rest[:, 0] -= 0.8 * torso_pitch
+        rest[:, 7] -= 0.8 * torso_pitch
+        return rest
+
+    def _within_reach(self, target: Tensor, measured: Measurement) -> Tensor:
+        """Draw targets (N, 2, 3) that lie farther from the shoulders than the arms are long towards them.
+
+        They keep their distance from the sagittal plane of the target, so that the hands come down beside the box.
+        """
+        robot = measured.robot
+        pose = self._arms.forward(robot.joint_position[:, WAIST_JOINTS], robot.joint_position[:, ARM_JOINTS])
+        both = robot.base_quaternion[:, None].expand(-1, 2, -1)
+        shoulder = rotate(both, pose.shoulder) + robot.base_position[:, None]
+        offset = rotate_about_vertical(-measured.heading[:, None], target - shoulder)
+        lateral = offset[..., 1].abs().clamp(max=0.9 * self.config.reach_length)
+        room = (self.config.reach_length**2 - lateral.square()).sqrt()
+        in_plane = offset[..., [0, 2]].norm(dim=-1)
+        share = (room / in_plane.clamp_min(1e-6)).clamp(max=1.0)
+        offset = torch.stack([offset[..., 0] * share, offset[..., 1], offset[..., 2] * share], -1)
+        return shoulder + rotate_about_vertical(measured.heading[:, None], offset)
+
+    def _correct(self, error: Tensor) -> None:
+        """Integrate the palms' position error (N, 2, 3) before the grasp; gravity and tracking cause it."""
+        config, memory = self.config, self._memory
+        active = (memory.phase == DESCEND) & (memory.descent >= 1.0)
+        limit = config.largest_correction
+        change = config.correction_gain * error * active[:, None, None]
+        memory.correction = (memory.correction + change).clamp(-limit, limit)
+
+
+def _smooth(share: Tensor) -> Tensor:
+    """Smooth step from 0 to 1 with zero slope at both ends."""
+    return share * share * (3.0 - 2.0 * share)

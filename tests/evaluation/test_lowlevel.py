@@ -1,0 +1,286 @@
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from evaluation.harness import Arena, Push
+from evaluation.lowlevel import main
+from evaluation.statistics import wilson_interval
+from evaluation.tracking import (
+    GROUPS,
+    group_of,
+    mode_episodes,
+    motion_modes,
+    protocol_episodes,
+    run_modes,
+    run_tracking,
+    run_walking,
+    suite_terrain,
+    tracking_figures,
+    walking_episodes,
+)
+from lowlevel.controller import WEIGHTS_FILE, Controller
+from lowlevel.measures import TRACKING_FIGURES
+from lowlevel.terrain import TILES, TerrainConfig
+from robots.g1.constants import ARM_JOINTS
+
+FLAT = TerrainConfig(tile_size=16.0)
+
+
+@pytest.fixture(scope="module")
+def controller(untrained_controller: Path) -> Controller:
+    return Controller.load(untrained_controller)
+
+
+@pytest.fixture(scope="module")
+def arena(controller: Controller) -> Arena:
+    return Arena(controller, FLAT, num_threads=1, batch=4)
+
+
+def test_an_episode_is_the_same_in_evaluations_of_any_size(controller: Controller) -> None:
+    space = controller.config.command_space
+    few, many = protocol_episodes(space, 3, 7, 2), protocol_episodes(space, 20, 7, 2)
+    for a, b in zip(few, many, strict=False):
+        assert a.seed == b.seed and a.tile == b.tile and a.starts == b.starts == (0.0, 10.0)
+        assert torch.equal(a.commands, b.commands) and torch.equal(a.flags, b.flags)
+    assert not torch.equal(few[0].commands, protocol_episodes(space, 3, 8, 2)[0].commands)
+
+
+def test_commands_follow_the_mixture(controller: Controller) -> None:
+    episodes = protocol_episodes(controller.config.command_space, 400, 0, 2)
+    commands = torch.cat([episode.commands for episode in episodes])
+    group = group_of(commands, torch.cat([episode.flags for episode in episodes])[:, None])
+    for index, share in enumerate((0.4, 0.4, 0.2)):
+        low, high = wilson_interval(int((group == index).sum()), len(group), confidence=0.999)
+        assert low < share + 0.005 and share - 0.005 < high, GROUPS[index]
+    walking, standing = commands[group == 0], commands[group == 1]
+    assert walking[:, 3].min() >= 0.55 and walking[:, 4].abs().max() <= 0.2
+    assert walking[:, 5].min() >= -0.2 and walking[:, 5].max() <= 0.5
+    assert standing[:, :3].abs().max() == 0.0 and standing[:, 3].min() < 0.35 and standing[:, 5].max() > 1.3
+    assert {episode.tile for episode in episodes[::2]} == {0} and {e.tile for e in episodes[1::2]} == {1}
+
+
+def test_episode_means_agree_with_a_plain_recount(arena: Arena, controller: Controller) -> None:
+    """Every robot is followed on its own and its errors are written out from their definitions."""
+    episodes = protocol_episodes(controller.config.command_space, 4, 1, 1, duration=0.5)
+    episodes[0] = replace(episodes[0], pushes=(Push(0.1, (0.0, 12.0, 0.0)),))
+    result = run_tracking(arena, episodes)
+    moments = list(arena.run(episodes))
+    names = list(TRACKING_FIGURES)
+    for row in range(4):
+        recount: dict[str, list[float]] = {"E_h": [], "E_v": [], "E_arm": [], "E_omega": []}
+        for moment in moments:
+            if not moment.active[row]:
+                break
+            command, robot = moment.command[row].numpy(), moment.measured.robot
+            yaw = moment.measured.heading[row].item()
+            forward = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+            velocity = forward @ robot.base_linear_velocity[row, :2].numpy()
+            height = robot.base_position[row, 2].item()  # flat ground at zero
+            recount["E_v"].append(float(np.abs(velocity - command[:2]).sum()))
+            recount["E_omega"].append(abs(moment.measured.yaw_rate[row].item() - command[2]))
+            recount["E_h"].append(abs(height - command[3]))
+            arms = robot.joint_position[row, ARM_JOINTS].numpy() - command[7:]
+            recount["E_arm"].append(float(np.abs(arms).sum()))
+        for name, values in recount.items():
+            expected = float(np.mean(values))
+            assert result.errors["all"][row, names.index(name)] == pytest.approx(expected, rel=1e-4), name
+        assert result.falls["all"][row] == float(any(moment.fell[row] for moment in moments))
+    assert result.falls["all"][0] == 1.0, "twelve metres per second sideways fell nobody"
+    first = group_of(episodes[0].commands, episodes[0].flags[:, None])
+    for index, group in enumerate(GROUPS):
+        values = result.errors[group][0]
+        if first[0] == index:
+            np.testing.assert_array_equal(values, result.errors["all"][0])
+        else:
+            assert np.isnan(values).all()
+    assert np.isnan(result.errors["all_steady"]).all(), "half a second is all transient"
+    assert np.isfinite(result.transient[:25]).all() and np.isnan(result.transient[25:]).all()
+
+
+def test_a_fallen_episode_weighs_as_much_as_any_other(arena: Arena, controller: Controller) -> None:
+    episodes = protocol_episodes(controller.config.command_space, 4, 1, 1, duration=0.4)
+    episodes[0] = replace(episodes[0], pushes=(Push(0.0, (0.0, 12.0, 0.0)),))
+    result = run_tracking(arena, episodes)
+    figures = tracking_figures(result, ["flat"])
+    assert figures["E_v"].n == 4 and figures["E_v_steady"].value is None
+    assert figures["E_v"].value == pytest.approx(result.errors["all"][:, 0].mean())
+    assert figures["fall_rate"].value == pytest.approx(np.mean(result.falls["all"]))
+    assert figures["fall_rate"].value >= 0.25
+    assert figures["E_h_on_flat"] == figures["E_h"]
+    assert set(TRACKING_FIGURES) <= set(figures)
+
+
+def test_steady_figures_begin_two_seconds_after_a_change(arena: Arena, controller: Controller) -> None:
+    """With a transient of 0.1 s the steady mean is the mean over the other steps."""
+    import evaluation.tracking as tracking
+
+    episodes = protocol_episodes(controller.config.command_space, 2, 1, 1, duration=0.2)
+    heights = [moment.measured.base_height[0] - moment.command[0, 3] for moment in arena.run(episodes)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracking, "TRANSIENT", 0.1)
+        result = run_tracking(arena, episodes)
+    expected = torch.stack(heights[5:]).abs().mean().item()
+    column = list(TRACKING_FIGURES).index("E_h")
+    assert result.errors["all_steady"][0, column] == pytest.approx(expected, rel=1e-4)
+
+
+def test_walking_counts_falls_and_speed(arena: Arena, controller: Controller) -> None:
+    episodes = [
+        replace(episode, duration=0.3)
+        for episode in walking_episodes(controller.config.command_space, 2, 0, 1)
+    ]
+    assert episodes[0].commands[0, 0] == 0.5 and episodes[0].commands[0, 1:3].abs().max() == 0.0
+    episodes[1] = replace(episodes[1], pushes=(Push(0.0, (0.0, 12.0, 0.0)),))
+    figures = run_walking(arena, episodes)
+    moments = list(arena.run(episodes))
+    speeds = [
+        np.mean([moment.measured.linear_velocity[row, 0].item() for moment in moments if moment.active[row]])
+        for row in (0, 1)
+    ]
+    assert figures["walk_half_mps_survival"].value == 0.5
+    assert figures["walk_half_mps_speed"].value == pytest.approx(np.mean(speeds), rel=1e-3)
+
+
+def test_activations_are_averaged_by_mode(arena: Arena, controller: Controller) -> None:
+    import evaluation.tracking as tracking
+
+    space = controller.config.command_space
+    lower, upper = space.bounds()
+    for mode in motion_modes(space).values():
+        assert ((mode >= lower) & (mode <= upper)).all()
+    episodes = [replace(episode, duration=0.1) for episode in mode_episodes(space, 0)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracking, "TRANSIENT", 0.05)
+        activations = run_modes(arena, episodes)
+    assert activations.shape == (6, 4)
+    np.testing.assert_allclose(activations.sum(axis=1), 1.0, atol=1e-5)
+    second_mode = episodes[5:9]
+    gates = torch.stack([moment.gate for moment in arena.run(second_mode)])[2:]
+    by_hand = gates.mean(dim=(0, 1)).numpy()
+    np.testing.assert_allclose(activations[1], by_hand, atol=0.02)
+
+
+def test_suites() -> None:
+    assert suite_terrain("simple").tiles == ("flat", "irregular")
+    with pytest.raises(ValueError, match="unknown suite 'hard'; choose one of simple, full"):
+        suite_terrain("hard")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delitem(TILES, "irregular")
+        with pytest.raises(ValueError, match="does not exist yet: irregular"):
+            suite_terrain("simple")
+
+
+# -- the command ---------------------------------------------------------------------------------------------
+
+
+def test_command_writes_a_report(
+    untrained_controller: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "controller"
+    shutil.copytree(untrained_controller, folder)
+    output = tmp_path / "results" / "report"
+    options = ["--episodes", "2", "--walk-episodes", "1", "--seed", "5", "--write-metrics"]
+    main(["--controller", str(folder), "--output", str(output), *options])
+    assert {file.name for file in output.iterdir()} == {
+        "report.md",
+        "metrics.json",
+        "tracking.png",
+        "transient.png",
+        "experts.png",
+    }
+    content = json.loads((output / "metrics.json").read_text())
+    assert content["seed"] == 5 and content["suite"] == "simple" and len(content["controller"]) == 16
+    assert content["figures"]["E_v"]["unit"] == "m/s" and content["figures"]["E_v"]["n"] == 2
+    low, high = content["figures"]["E_v"]["ci95"]
+    assert low <= content["figures"]["E_v"]["value"] <= high
+    assert {"E_stumble", "fall_rate", "E_arm_steady", "walk_half_mps_survival"} <= set(content["figures"])
+    assert "0.145" in (output / "report.md").read_text(), "the paper's figure stands beside ours"
+    assert str(output / "report.md") in capsys.readouterr().out
+    stored = json.loads((folder / "controller.json").read_text())["provenance"]["metrics"]
+    assert stored["simple"]["figures"]["E_v"] == content["figures"]["E_v"]
+    assert list(tmp_path.joinpath("results").iterdir()) == [output], "no temporary files stay behind"
+
+
+def _truncate(folder: Path) -> None:
+    weights = folder / WEIGHTS_FILE
+    weights.write_bytes(weights.read_bytes()[:5000])
+
+
+def _spoil(folder: Path) -> None:
+    tensors = load_file(folder / WEIGHTS_FILE)
+    name = next(name for name in tensors if name.startswith("head."))
+    tensors[name].view(-1)[0] = float("nan")
+    save_file(tensors, folder / WEIGHTS_FILE)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / "controller.json").unlink(), "controller.json is missing"),
+        (_truncate, "damaged or truncated"),
+        (_spoil, "not finite"),
+    ],
+    ids=["empty", "truncated", "nan"],
+)
+def test_a_bad_controller_is_refused_in_one_sentence(
+    untrained_controller: Path,
+    tmp_path: Path,
+    damage: Callable[[Path], None],
+    message: str,
+) -> None:
+    folder = tmp_path / "controller"
+    shutil.copytree(untrained_controller, folder)
+    damage(folder)
+    with pytest.raises(SystemExit) as stop:
+        main(["--controller", str(folder), "--output", str(tmp_path / "report")])
+    assert message in str(stop.value) and "\n" not in str(stop.value)
+    assert not (tmp_path / "report").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--suite", "hard"], "unknown suite 'hard'"),
+        (["--episodes", "0"], "--episodes must be at least 1"),
+        (["--output", "{file}/report"], "is not a folder"),
+    ],
+)
+def test_bad_options_are_refused_in_one_sentence(
+    untrained_controller: Path, tmp_path: Path, options: list[str], message: str
+) -> None:
+    file = tmp_path / "file"
+    file.write_text("here already")
+    with pytest.raises(SystemExit) as stop:
+        main(["--controller", str(untrained_controller), *(option.format(file=file) for option in options)])
+    assert message in str(stop.value) and "\n" not in str(stop.value)
+
+
+def test_interrupting_leaves_nothing_behind(untrained_controller: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "evaluation.lowlevel", "--controller", str(untrained_controller)]
+    process = subprocess.Popen(
+        [*command, "--output", str(tmp_path / "report"), "--threads", "1"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    assert process.stdout is not None
+    assert "evaluating" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=20.0)
+    assert process.returncode != 0
+    assert errors.strip() == "evaluate-lowlevel: interrupted, nothing was written"
+    assert list(tmp_path.iterdir()) == []

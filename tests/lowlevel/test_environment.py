@@ -1,0 +1,188 @@
+"""The environment: finite, deterministic, honest about time limits, mirrored, and equal to the frozen controller."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from lowlevel.commands import HEIGHT, CommandRange
+from lowlevel.controller import Controller, Proprioception
+from lowlevel.environment import EnvironmentConfig, PilotEnvironment
+from lowlevel.export import freeze
+from lowlevel.measures import TRACKING_FIGURES, measure
+from lowlevel.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, MIRRORS, PRIVILEGED_SIZE, NoiseConfig, split_frame
+from lowlevel.ppo import PPOConfig
+from lowlevel.randomization import RandomizationConfig
+from lowlevel.rewards import REWARD_TERMS, RewardWeights
+from lowlevel.terrain import TerrainConfig
+from lowlevel.trainer import Trainer, TrainingConfig
+
+SMALL = EnvironmentConfig(num_robots=6, num_threads=1)
+QUIET = replace(
+    SMALL,
+    start_in_posture=0.0,
+    noise=NoiseConfig(0.0, 0.0, 0.0, 0.0, 0.0),
+    randomization=RandomizationConfig.for_evaluation(),
+)
+
+
+def roll_out(environment: PilotEnvironment, steps: int, scale: float = 0.3) -> list[torch.Tensor]:
+    """Observations and rewards of ``steps`` random actions."""
+    generator = torch.Generator().manual_seed(1)
+    environment.reset(spread_episodes=True)
+    seen = []
+    for _ in range(steps):
+        result = environment.step(scale * torch.randn(environment.num_robots, 29, generator=generator))
+        seen.append(torch.cat([*result.observation.values(), result.reward[:, None], result.next_privileged], dim=-1))
+    return seen
+
+
+def test_observations_have_the_announced_shapes_and_are_finite() -> None:
+    environment = PilotEnvironment(replace(SMALL, terrain=TerrainConfig(tiles=("flat", "irregular"))))
+    observation = environment.reset()
+    shapes = {name: tuple(value.shape) for name, value in observation.items()}
+    history = FRAME_SIZE * (HISTORY_LENGTH + 1)
+    assert shapes == {
+        "history": (6, history),
+        "elevation_map": (6, 121),
+        "flag": (6, 1),
+        "privileged": (6, PRIVILEGED_SIZE),
+    }
+    assert all(torch.isfinite(values).all() for values in roll_out(environment, 30))
+
+
+def test_same_seed_same_rollout_other_seed_other_rollout() -> None:
+    first = roll_out(PilotEnvironment(SMALL, seed=3), 20)
+    again = roll_out(PilotEnvironment(replace(SMALL, num_threads=2), seed=3), 20)
+    other = roll_out(PilotEnvironment(SMALL, seed=4), 20)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not torch.equal(first[-1], other[-1])
+
+
+def test_restored_state_continues_bit_exactly() -> None:
+    environment = PilotEnvironment(replace(SMALL, terrain=TerrainConfig(tiles=("irregular",))), seed=5)
+    roll_out(environment, 15)
+    saved = environment.state_dict()
+    saved = {key: ({k: v.clone() for k, v in value.items()} if isinstance(value, dict) else value) for key, value in saved.items()}
+    actions = 0.3 * torch.randn(40, 6, 29)
+    expected = [environment.step(action) for action in actions]
+    other = PilotEnvironment(replace(SMALL, terrain=TerrainConfig(tiles=("irregular",))), seed=99)
+    other.reset()
+    other.load_state_dict(saved)
+    for action, before in zip(actions, expected, strict=True):
+        after = other.step(action)
+        assert torch.equal(after.reward, before.reward)
+        assert torch.equal(after.observation["history"], before.observation["history"])
+
+
+def test_state_of_another_number_of_robots_is_refused() -> None:
+    saved = PilotEnvironment(SMALL).state_dict()
+    with pytest.raises(ValueError, match="number of robots"):
+        PilotEnvironment(replace(SMALL, num_robots=3)).load_state_dict(saved)
+
+
+def test_control_period_is_checked() -> None:
+    with pytest.raises(ValueError, match=r"0\.02 s"):
+        PilotEnvironment(replace(SMALL, timestep=0.005))
+
+
+def test_zero_action_stands_for_a_second_from_any_height() -> None:
+    environment = PilotEnvironment(replace(QUIET, num_robots=16, start_in_posture=1.0), seed=2)
+    environment.open_range = CommandRange(velocity=0.0, height=1.0, torso=0.0, arms=0.0)
+    environment.reset()
+    results = [environment.step(torch.zeros(16, 29)) for _ in range(50)]
+    assert not torch.stack([result.terminated for result in results]).any()
+    error = results[-1].measured.base_height - results[-1].command[:, HEIGHT]
+    assert error.abs().max() < 0.06
+
+
+def test_falls_terminate_and_time_limits_truncate() -> None:
+    environment = PilotEnvironment(replace(QUIET, episode_length=0.2))
+    environment.reset()
+    for _ in range(9):
+        result = environment.step(torch.zeros(6, 29))
+    assert not (result.terminated | result.truncated).any()
+    result = environment.step(torch.zeros(6, 29))
+    assert result.truncated.all() and not result.terminated.any()
+    assert (environment.buffers.episode_step == 0).all()
+    toppled = PilotEnvironment(QUIET)
+    toppled.reset()
+    everything = [toppled.step(torch.full((6, 29), 4.0)) for _ in range(60)]
+    assert torch.stack([result.terminated for result in everything]).any(dim=0).all()
+
+
+def test_successor_state_is_the_one_before_the_reset() -> None:
+    environment = PilotEnvironment(replace(QUIET, episode_length=0.1))
+    environment.reset()
+    for _ in range(5):
+        result = environment.step(0.5 * torch.ones(6, 29))
+    assert result.truncated.all()
+    speed = result.next_privileged[:, :3]
+    assert torch.allclose(speed, result.measured.linear_velocity)
+    assert not torch.allclose(speed, result.observation["privileged"][:, :3])
+
+
+def test_no_part_of_an_observation_is_constant() -> None:
+    """Blocks that never change would be dead inputs; the ones that may are named."""
+    environment = PilotEnvironment(replace(SMALL, num_robots=32))
+    frames = torch.stack(
+        [values[:, : FRAME_SIZE * (HISTORY_LENGTH + 1)][:, -FRAME_SIZE:] for values in roll_out(environment, 60)]
+    )
+    for name, block in split_frame(frames.flatten(0, 1)).items():
+        assert (block.std(dim=0) > 0).all(), name
+
+
+def test_mirrors_cover_their_vectors() -> None:
+    environment = PilotEnvironment(SMALL)
+    observation = environment.reset()
+    for key in ("history", "elevation_map", "privileged"):
+        values = observation[key].numpy()
+        assert (MIRRORS[key](MIRRORS[key](values)) == values).all()
+    assert sum(block.size for block in FRAME) == FRAME_SIZE
+
+
+def test_every_reward_weight_has_a_term_and_every_term_a_weight() -> None:
+    assert {field.name for field in fields(RewardWeights)} == set(REWARD_TERMS)
+
+
+def test_frozen_controller_repeats_the_training_policy(tmp_path) -> None:
+    """Controller.act on noise-free measurements gives the targets that the environment applies."""
+    config = TrainingConfig(environment=QUIET, ppo=PPOConfig(steps_per_update=8, minibatches=2))
+    trainer = Trainer(config, tmp_path)
+    generator = torch.Generator().manual_seed(0)
+    weight = trainer.ppo.actor.head.output_weight
+    weight.data += 0.02 * torch.randn(weight.shape, generator=generator)
+    freeze(trainer).save(tmp_path / "controller")
+    controller = Controller.load(tmp_path / "controller")
+    controller.reset(6)
+    environment = trainer.environment
+    observation = environment.reset()
+    for _ in range(25):
+        measured = measure(environment.simulation.read(), environment.terrain)
+        robot = measured.robot
+        targets = controller.act(
+            Proprioception(
+                robot.joint_position, robot.joint_velocity, robot.base_angular_velocity, measured.projected_gravity
+            ),
+            environment.buffers.elevation + 0.75,
+            environment.buffers.command,
+            environment.buffers.flag,
+        )
+        result = environment.step(trainer.ppo.deterministic(observation))
+        observation = result.observation
+        assert torch.allclose(targets, environment.buffers.previous_target, atol=2e-5)
+        assert torch.allclose(controller.reference, environment.buffers.reference, atol=0.2)
+
+
+def test_tracking_figures_vanish_for_a_robot_that_does_as_told() -> None:
+    environment = PilotEnvironment(QUIET)
+    environment.open_range = CommandRange(velocity=0.0, height=0.0, torso=0.0, arms=0.0)
+    environment.reset()
+    measured = measure(environment.simulation.read(), environment.terrain)
+    command = environment.buffers.command.clone()
+    command[:, :2] = measured.linear_velocity[:, :2]
+    command[:, 2] = measured.yaw_rate
+    command[:, HEIGHT] = measured.base_height
+    command[:, 7:] = measured.robot.joint_position[:, 15:]
+    for name in ("E_v", "E_omega", "E_h", "E_arm", "E_stumble"):
+        assert TRACKING_FIGURES[name][1](measured, command).abs().max() < 1e-5, name

@@ -1,0 +1,257 @@
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+
+import numpy as np
+import pytest
+import torch
+from small_learner import (
+    COMMANDS,
+    MIRRORS,
+    NETWORKS,
+    SIZES,
+    asymmetry,
+    best_action,
+    make_ppo,
+    observation,
+    run_update,
+    tracking_error,
+)
+
+from lowlevel.learner import adapted_rate, clipped_surrogate
+from lowlevel.ppo import PPO, NonFiniteError, PPOConfig
+from lowlevel.symmetry import TensorMirrors
+
+SMALL = {"critic_learning_rate": 2e-3, "actor_learning_rate": 1e-3}
+
+
+def test_clipped_surrogate_by_hand() -> None:
+    # ratios 1, 1.5, 1.5, 0.5, 0.5 with advantages 2, 1, -1, 1, -1 and clip 0.2
+    log_ratio = torch.tensor([1.0, 1.5, 1.5, 0.5, 0.5]).log()
+    advantage = torch.tensor([2.0, 1.0, -1.0, 1.0, -1.0])
+    loss = clipped_surrogate(log_ratio - 3.0, torch.full((5,), -3.0), advantage, 0.2)
+    torch.testing.assert_close(loss, torch.tensor([-2.0, -1.2, 1.5, -0.5, 0.8]))
+
+
+def test_learning_rate_follows_the_kl_divergence() -> None:
+    bounds = (1e-5, 1e-3)
+    assert adapted_rate(3e-4, 0.021, 0.01, bounds) == pytest.approx(2e-4)
+    assert adapted_rate(3e-4, 0.004, 0.01, bounds) == pytest.approx(4.5e-4)
+    assert adapted_rate(3e-4, 0.01, 0.01, bounds) == 3e-4
+    assert adapted_rate(1.2e-5, 1.0, 0.01, bounds) == 1e-5
+    assert adapted_rate(9e-4, 0.0, 0.01, bounds) == 1e-3
+    assert adapted_rate(3e-4, 1.0, 0.0, bounds) == 3e-4
+
+
+def test_only_the_actor_rate_adapts() -> None:
+    ppo = make_ppo(desired_kl=1e-9)
+    run_update(ppo, 0)
+    rates = {name: o.param_groups[0]["lr"] for name, o in ppo.learner.optimizers.items()}
+    assert rates == {"actor": 1e-5, "critic": 5e-4, "estimator": 5e-4}
+
+
+def test_kl_is_that_of_two_gaussians() -> None:
+    ppo = make_ppo(symmetry="none", epochs=1, minibatches=1, estimator_epochs=1)
+    run_update(ppo, 0)
+    generator = torch.Generator().manual_seed(1)
+    observed = observation(generator, 32)
+    for _ in range(12):
+        ppo.act(observed)
+        never = torch.zeros(32, dtype=torch.bool)
+        ppo.record(torch.randn(32, generator=generator), never, never, observed["privileged"])
+    old_mean, old_std = ppo.storage.flat("mean").clone(), ppo.actor.log_std.detach().exp()
+    with torch.no_grad():
+        ppo.actor.log_std.add_(torch.tensor([0.1, -0.2, 0.0, 0.3]))
+        ppo.actor.head.output_bias.add_(0.2)  # every expert proposes 0.2 more
+    new_std = ppo.actor.log_std.detach().exp()
+    index = torch.arange(ppo.storage.size)
+    samples, mirrored = ppo._samples(index, estimating=False)
+    losses = ppo.learner.losses(samples, mirrored, old_std, estimating=False)
+    expected = torch.log(new_std / old_std) + (old_std**2 + 0.2**2) / (2 * new_std**2) - 0.5
+    assert old_mean.shape == (384, 4)
+    assert float(losses["kl"]) == pytest.approx(float(expected.sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize("symmetry", ["none", "augmentation", "loss"])
+def test_learns_to_track_a_linear_function_of_the_frame(symmetry: str) -> None:
+    ppo = make_ppo(64, symmetry=symmetry, **SMALL)
+    before = tracking_error(ppo)
+    figures = [run_update(ppo, seed) for seed in range(40)]
+    assert tracking_error(ppo) < 0.35 * before
+    assert figures[-1]["kl"] < 0.05
+    assert all(math.isfinite(number) for update in figures for number in update.values())
+
+
+def test_symmetry_options_make_the_policy_more_symmetric() -> None:
+    measured = {}
+    for symmetry in ("none", "augmentation", "loss"):
+        ppo = make_ppo(64, symmetry=symmetry, **SMALL)
+        for seed in range(15):
+            run_update(ppo, seed)
+        measured[symmetry] = asymmetry(ppo)
+    assert measured["augmentation"] < 0.7 * measured["none"]
+    assert measured["loss"] < 0.3 * measured["none"]
+
+
+def test_mirror_images_start_at_ratio_one_even_if_the_policy_is_asymmetric() -> None:
+    ppo = make_ppo(symmetry="augmentation", epochs=1, minibatches=1, estimator_epochs=1)
+    run_update(ppo, 0)
+    with torch.no_grad():
+        for parameter in ppo.actor.head.parameters():
+            parameter.add_(0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
+    assert asymmetry(ppo) > 0.05
+    figures = run_update(ppo, 1)
+    assert figures["clip_fraction"] == 0.0 and abs(figures["kl"]) < 1e-6
+
+
+def test_mirror_images_are_consistent_with_the_mirrors() -> None:
+    ppo = make_ppo(symmetry="augmentation", epochs=1, estimator_epochs=1)
+    run_update(ppo, 0)
+    storage = ppo.storage
+    for key in ("history", "action", "next_privileged"):
+        mirror = MIRRORS["privileged" if key == "next_privileged" else key]
+        expected = mirror(storage.flat(key).numpy()).astype(np.float32)
+        np.testing.assert_array_equal(storage.images(key).numpy(), expected)
+    assert torch.equal(storage.images("returns"), storage.flat("returns"))
+    samples, mirrored = ppo._samples(torch.arange(10), estimating=True)
+    assert mirrored == 5
+    assert torch.equal(samples["action"][:5], storage.images("action")[:5])
+    assert torch.equal(samples["action"][5:], storage.flat("action")[5:10])
+
+
+def test_tensor_mirrors_check_what_they_are_given() -> None:
+    cpu = torch.device("cpu")
+    mirrors = TensorMirrors(MIRRORS, SIZES, cpu)
+    action = torch.randn(3, 4)
+    assert torch.equal(mirrors("action", mirrors("action", action)), action)
+    with pytest.raises(ValueError, match="no mirror was given for privileged"):
+        TensorMirrors({key: mirror for key, mirror in MIRRORS.items() if key != "privileged"}, SIZES, cpu)
+    with pytest.raises(ValueError, match="mirror of action has 121 entries, expected 4"):
+        TensorMirrors({**MIRRORS, "action": MIRRORS["elevation_map"]}, SIZES, cpu)
+
+
+def test_resume_is_bit_exact() -> None:
+    straight = make_ppo()
+    for seed in range(4):
+        straight_figures = run_update(straight, seed)
+
+    first = make_ppo()
+    for seed in range(2):
+        run_update(first, seed)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = make_ppo()
+    run_update(second, 17)  # whatever was there before must not matter
+    second.load_state_dict(torch.load(file, weights_only=True))
+    for seed in range(2, 4):
+        resumed_figures = run_update(second, seed)
+
+    assert resumed_figures == straight_figures
+    for module in ("actor", "critic"):
+        expected, actual = getattr(straight, module).state_dict(), getattr(second, module).state_dict()
+        assert all(torch.equal(expected[name], actual[name]) for name in expected)
+    assert second.updates == straight.updates == 4
+    assert second.learning_rate == straight.learning_rate
+
+
+def test_observations_that_are_not_finite_are_named() -> None:
+    ppo = make_ppo()
+    observed = observation(torch.Generator().manual_seed(0), 32)
+    observed["history"][7, 3] = float("nan")
+    with pytest.raises(NonFiniteError, match="'history' at rollout step 0 is not finite in 1 of 32 rows: 7"):
+        ppo.act(observed)
+
+
+def test_rewards_that_are_not_finite_are_named() -> None:
+    ppo = make_ppo()
+    observed = observation(torch.Generator().manual_seed(0), 32)
+    ppo.act(observed)
+    never = torch.zeros(32, dtype=torch.bool)
+    reward = torch.zeros(32)
+    reward[5] = float("inf")
+    with pytest.raises(NonFiniteError, match="reward at rollout step 0 is not finite in 1 of 32 rows: 5"):
+        ppo.record(reward, never, never, observed["privileged"])
+
+
+def test_a_loss_that_is_not_finite_never_reaches_the_weights() -> None:
+    ppo = make_ppo(symmetry="none")
+    run_update(ppo, 0)
+    observed = observation(torch.Generator().manual_seed(0), 32)
+    never = torch.zeros(32, dtype=torch.bool)
+    for _ in range(12):
+        ppo.act(observed)
+        ppo.record(torch.full((32,), 1e25), never, never, observed["privileged"])
+    weights = [p.clone() for group in ppo.learner.groups.values() for p in group]
+    with pytest.raises(NonFiniteError, match="critic"):
+        ppo.update(observed)
+    after = [p for group in ppo.learner.groups.values() for p in group]
+    assert all(torch.equal(old, new) for old, new in zip(weights, after, strict=True))
+
+
+def test_timeouts_are_bootstrapped_with_the_state_before_the_reset() -> None:
+    ppo = make_ppo(robots=2, steps_per_update=1, minibatches=1, gamma=0.5, symmetry="none")
+    before, after = (observation(torch.Generator().manual_seed(seed), 2) for seed in (0, 1))
+    final = torch.randn(2, SIZES.privileged)
+    ppo.actor.normalizer.update(before["history"][:, -SIZES.frame :])
+    ppo.act(before)
+    ppo.record(torch.ones(2), torch.tensor([True, False]), torch.tensor([False, True]), final)
+    with torch.no_grad():
+        expected = torch.stack([torch.tensor(1.0), 1.0 + 0.5 * ppo.critic(final)[1]])
+    ppo._store_returns(after["privileged"])
+    torch.testing.assert_close(ppo.storage.flat("returns"), expected)
+
+
+def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
+    ppo = make_ppo(2048, initial_std=0.3, std_bounds=(0.3, 0.4), steps_per_update=1, minibatches=1)
+    observed = observation(torch.Generator().manual_seed(0), 2048)
+    noise = ppo.act(observed) - ppo.deterministic(observed)
+    torch.testing.assert_close(noise.std(dim=0), torch.full((4,), 0.3), rtol=0.06, atol=0)
+    with torch.no_grad():
+        ppo.actor.log_std.fill_(5.0)
+    ppo.storage.clear()
+    run_update(ppo, 0)
+    assert ppo.actor.log_std.exp().max() == pytest.approx(0.4)
+
+
+def test_bfloat16_hidden_layers_change_little() -> None:
+    exact, rounded = make_ppo(), make_ppo(autocast=True)
+    run_update(exact, 0)
+    figures = run_update(rounded, 0)
+    assert all(math.isfinite(number) for number in figures.values())
+    rounded.load_state_dict(exact.state_dict())
+    observed = observation(torch.Generator().manual_seed(1), 64)
+    mean = rounded.deterministic(observed)
+    assert mean.dtype == torch.float32
+    assert 0 < (mean - exact.deterministic(observed)).abs().max() < 0.02
+
+
+def test_ablated_networks_learn_too() -> None:
+    network = dataclasses.replace(NETWORKS, vision=False, attention=False, mixture=False)
+    ppo = make_ppo(network=network)
+    before = ppo.deterministic(observation(torch.Generator().manual_seed(5), 8))
+    run_update(ppo, 0)
+    after = ppo.deterministic(observation(torch.Generator().manual_seed(5), 8))
+    assert not torch.equal(before, after)
+
+
+def test_bad_settings_are_refused() -> None:
+    with pytest.raises(ValueError, match="symmetry must be"):
+        PPOConfig(symmetry="both")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="outside std_bounds"):
+        PPOConfig(initial_std=2.0)
+    with pytest.raises(ValueError, match="estimator_epochs 9"):
+        PPOConfig(estimator_epochs=9)
+    with pytest.raises(ValueError, match="do not split into 5 minibatches"):
+        PPO(PPOConfig(steps_per_update=2, minibatches=5), NETWORKS, SIZES, MIRRORS, 4, "cpu", COMMANDS)
+    with pytest.raises(ValueError, match="only 0 of 12 rollout steps"):
+        make_ppo().update(observation(torch.Generator(), 32))
+
+
+def test_best_action_of_the_test_task_is_symmetric() -> None:
+    observed = observation(torch.Generator().manual_seed(0), 8)
+    mirrors = TensorMirrors(MIRRORS, SIZES, torch.device("cpu"))
+    mirrored = {key: mirrors(key, value) for key, value in observed.items()}
+    torch.testing.assert_close(best_action(mirrored), mirrors("action", best_action(observed)))
