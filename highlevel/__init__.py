@@ -1,1 +1,8 @@
-"""."""
+"""High level: planners that drive the frozen controller with whole-body commands.
+
+Importing this package registers every task as a Gymnasium environment, such as ``pilot/LiftBox-v0``.
+"""
+
+from highlevel.registration import register_tasks
+
+register_tasks()

@@ -188,8 +188,10 @@ class CommandEnvironment:
     # -- stepping ---------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def step(self, action: Tensor) -> StepResult:
+    def step(self, action: Tensor, auto_reset: bool = True) -> StepResult:
         """One decision: ``action`` (N, 21) in [-1, 1], held as an option of several control steps.
+
+        With ``auto_reset``, robots whose episode ended begin their next one before this returns.
 
         Raises:
             RuntimeError: if :meth:`reset` was not called.
@@ -255,7 +257,7 @@ class CommandEnvironment:
             duration=self.decisions * self.decision_period,
         )
         over = torch.nonzero(result.done)[:, 0]
-        if len(over) == 0:
+        if len(over) == 0 or not auto_reset:
             return result
         self.episode = self.episode.clone()
         self.episode[over] += count

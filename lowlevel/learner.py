@@ -73,9 +73,9 @@ class PPOConfig:
     max_grad_norm: float = 1.0
     """Gradient norm to which each of the three groups is clipped."""
     symmetry: Literal["none", "augmentation", "loss"] = "augmentation"
-    """Mirror half of every minibatch, or penalise an asymmetric mean action, or neither."""
-    mirror_loss_weight: float = 1.0
-    """Weight of the symmetry loss [1/action units^2]; used by symmetry "loss" only."""
+    """Penalise an asymmetric policy ("loss"), and also mirror half of every minibatch ("augmentation")."""
+    mirror_loss_weight: float = 0.5
+    """Weight of the symmetry loss, the KL divergence between the policy and its mirror image [1/nat]."""
     mirror_loss_share: float = 0.25
     """Share of a minibatch on which the symmetry loss is taken."""
     autocast: bool = False
@@ -91,6 +91,8 @@ class PPOConfig:
         if self.symmetry not in ("none", "augmentation", "loss"):
             raise ValueError(f"symmetry must be none, augmentation or loss, not {self.symmetry!r}")
         low, high = self.std_bounds
+        if not 0 < self.mirror_loss_share <= 0.5:
+            raise ValueError(f"mirror_loss_share {self.mirror_loss_share} is not between 0 and 0.5")
         if not 0 < low <= self.initial_std <= high:
             raise ValueError(f"initial_std {self.initial_std} is outside std_bounds {self.std_bounds}")
 
@@ -169,22 +171,32 @@ class Learner:
         return self.distribution(mean).log_prob(action).sum(dim=1)
 
     def losses(
-        self, samples: Mapping[str, Tensor], mirrored: int, old_std: Tensor, estimating: bool
+        self,
+        samples: Mapping[str, Tensor],
+        mirrored: int,
+        images: Mapping[str, Tensor] | None,
+        old_std: Tensor,
+        estimating: bool,
     ) -> dict[str, Tensor]:
         """Losses of the groups ("actor", "critic", "estimator" if ``estimating``) and figures to log, all
         scalars.
 
-        ``samples``: B rows per name. The first ``mirrored`` of them are mirror images, which the KL
-        divergence leaves out. ``old_std`` (A,) is the noise of the policy that acted.
+        ``samples``: B rows per name. The first ``mirrored`` of them are mirror images, which the KL divergence
+        leaves out. ``images``: mirror images of the last rows, for the symmetry loss. ``old_std`` (A,) is the
+        noise of the policy that acted.
         """
-        losses = self._actor_losses(samples, mirrored, old_std)
+        losses = self._actor_losses(samples, mirrored, images, old_std)
         with self.autocast():
             value = self.critic(samples["privileged"])
         losses["critic"] = (value - samples["returns"]).square().mean()
         return losses | self._estimator_losses(samples) if estimating else losses
 
     def _actor_losses(
-        self, samples: Mapping[str, Tensor], mirrored: int, old_std: Tensor
+        self,
+        samples: Mapping[str, Tensor],
+        mirrored: int,
+        images: Mapping[str, Tensor] | None,
+        old_std: Tensor,
     ) -> dict[str, Tensor]:
         config = self.config
         with self.autocast():
@@ -195,12 +207,13 @@ class Learner:
         entropy = distribution.entropy()[0].sum()
         figures = {"surrogate": surrogate, "entropy": entropy}
         loss = surrogate - config.entropy_weight * entropy
-        if config.symmetry == "loss":
-            share = max(1, int(config.mirror_loss_share * len(mean)))
-            images = {key: self.mirrors(key, samples[key][:share]) for key in ACTOR_KEYS}
-            asymmetry = self.policy(images).mean - self.mirrors("action", mean[:share])
-            figures["symmetry"] = asymmetry.square().mean()
-            loss = loss + config.mirror_loss_weight * figures["symmetry"]
+        if images is not None:
+            with self.autocast():
+                image, _ = self.actor.decide(*(images[key] for key in POLICY_KEYS))
+            difference = image - self.mirrors("action", mean[-len(image) :])
+            deviations = difference / self.actor.log_std.exp().detach()
+            figures["asymmetry"] = 0.5 * deviations.square().sum(dim=1).mean()
+            loss = loss + config.mirror_loss_weight * figures["asymmetry"]
         with torch.no_grad():
             plain = slice(mirrored, None)
             old = Normal(samples["mean"][plain], old_std, validate_args=False)

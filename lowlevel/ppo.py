@@ -83,7 +83,7 @@ class PPO:
         widths |= {"velocity": VELOCITY_SIZE, "latent": network_config.latent}
         shapes: dict[str, tuple[int, ...]] = {name: (width,) for name, width in widths.items()}
         shapes |= dict.fromkeys(("log_prob", "reward", "advantage", "returns"), ())
-        images = config.symmetry == "augmentation"
+        images = config.symmetry != "none"
         self.storage = RolloutStorage(config.steps_per_update, num_envs, shapes, self.device, images)
         self._minibatch, rest = divmod(self.storage.size, config.minibatches)
         if rest:
@@ -160,7 +160,7 @@ class PPO:
         if calibrating:
             self._calibrate()
         explained = self._store_returns(observation_after["privileged"].to(self.device))
-        if config.symmetry == "augmentation":
+        if config.symmetry != "none":
             self._store_mirror_images()
         old_std = self.actor.log_std.detach().exp().clone()
         history: dict[str, list[float]] = {}
@@ -169,7 +169,8 @@ class PPO:
             order = torch.randperm(storage.size, generator=self.generator, device=self.device)
             for index in torch.split(order, self._minibatch):
                 samples, mirrored = self._samples(index, estimating)
-                losses = self.learner.losses(samples, mirrored, old_std, estimating)
+                images = self._images(index)
+                losses = self.learner.losses(samples, mirrored, images, old_std, estimating)
                 for name, number in self.learner.step(losses).items():
                     history.setdefault(name, []).append(number)
         means = {name: sum(numbers) / len(numbers) for name, numbers in history.items()}
@@ -230,7 +231,8 @@ class PPO:
         """Add the mirror image of every sample, with its log-probability under the policy that acted.
 
         With the log-probability of the original instead, the first ratio of a mirrored sample would not be
-        one, and an asymmetric policy would diverge.
+        one, and an asymmetric policy would diverge. With the one used here, mirrored samples move an action and
+        its mirror image alike and leave their difference as it is: that is what the symmetry loss is for.
         """
         for key in (*OBSERVATION_KEYS, "next_privileged", "action"):
             self.storage.images(key).copy_(self.mirrors(key, self.storage.flat(key)))
@@ -255,13 +257,24 @@ class PPO:
         if self.config.symmetry == "augmentation":
             mirrored = len(index) // 2
             index = torch.cat([index[:mirrored] + self.storage.size, index[mirrored:]])
-        names = [*POLICY_KEYS[1:], "privileged", "action", "mean", "log_prob", "advantage", "returns"]
-        if estimating or self.config.symmetry == "loss":
+        names = [*POLICY_KEYS, "privileged", "action", "mean", "log_prob", "advantage", "returns"]
+        if estimating:
             names += ["history", "next_privileged"]
-        samples = {name: self.storage.samples(name).index_select(0, index) for name in names}
-        frames = self.storage.samples("history")[:, -self.sizes.frame :]
-        samples["frame"] = frames.index_select(0, index)
-        return samples, mirrored
+        return {name: self._rows(name).index_select(0, index) for name in names}, mirrored
+
+    def _images(self, index: Tensor) -> dict[str, Tensor] | None:
+        """Mirror images of the last samples at ``index``, which :meth:`_samples` never mirrors."""
+        if self.config.symmetry == "none":
+            return None
+        share = max(1, int(self.config.mirror_loss_share * len(index)))
+        return {
+            name: self._rows(name).index_select(0, index[-share:] + self.storage.size) for name in POLICY_KEYS
+        }
+
+    def _rows(self, name: str) -> Tensor:
+        if name == "frame":
+            return self.storage.samples("history")[:, -self.sizes.frame :]
+        return self.storage.samples(name)
 
     @torch.no_grad()
     def _estimator_drift(self) -> float:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,8 +15,8 @@ import tyro
 from lowlevel import distributed
 from lowlevel.export import export_controller
 from lowlevel.presets import PRESETS
-from lowlevel.provenance import describe_run, write_run_description
-from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig
+from lowlevel.provenance import describe_run, read_training_config, write_run_description
+from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig, read_training_state
 
 
 @dataclass(frozen=True)
@@ -25,12 +24,14 @@ class Arguments:
     """Train a PILOT controller for the Unitree G1."""
 
     config: Annotated[TrainingConfig, tyro.conf.arg(name="")]
+    preset: str = "flat"
+    """Named configuration to start from, a key of lowlevel.presets.PRESETS."""
     output: Path = Path("runs/lowlevel")
     """Parent folder of the run's folder."""
     name: str = ""
     """Name of the run's folder; preset and time by default."""
     resume: Path | None = None
-    """Folder of a run to continue; its own configuration is used and all other options must be left out."""
+    """Folder of a run to continue with its own configuration; options given beside it replace parts of that."""
     warm_start: Path | None = None
     """Folder of a run whose networks, optimisers and curriculum a new run starts from."""
 
@@ -44,24 +45,24 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _run(arguments: list[str]) -> None:
-    preset_parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    preset_parser.add_argument("--preset", default="flat")
-    chosen, rest = preset_parser.parse_known_args(arguments)
+    chosen = _choose(arguments)
     if chosen.preset not in PRESETS:
         raise ValueError(f"unknown preset {chosen.preset!r}; choose one of {', '.join(PRESETS)}")
+    config = read_training_config(chosen.resume) if chosen.resume else PRESETS[chosen.preset]
     parsed = tyro.cli(
         Arguments,
-        args=rest,
-        default=Arguments(config=PRESETS[chosen.preset]),
-        description=f"Train a PILOT controller. --preset is one of {', '.join(PRESETS)} (now: {chosen.preset}); "
-        "the defaults below are that preset's.",
+        args=arguments,
+        default=Arguments(config=config, preset=chosen.preset),
+        description="Train a PILOT controller. The defaults below are those of the chosen preset, or of the resumed run.",
     )
     device = distributed.start(parsed.config.device)
     # Physics and learning take turns on the same cores.
     torch.set_num_threads(max(1, parsed.config.environment.num_threads))
     try:
-        trainer = _resumed(parsed.resume) if parsed.resume else _fresh(parsed, chosen.preset, device)
-        print(f"training in {trainer.folder}", flush=True)
+        trainer = _resumed(parsed) if parsed.resume else _fresh(parsed, device)
+        if distributed.rank() == 0:
+            write_run_description(trainer.folder, describe_run(parsed.config, parsed.preset))
+            print(f"training in {trainer.folder}", flush=True)
         trainer.train()
         if distributed.rank() == 0:
             export_controller(trainer, trainer.folder / "controller")
@@ -73,25 +74,31 @@ def _run(arguments: list[str]) -> None:
         distributed.stop()
 
 
-def _fresh(parsed: Arguments, preset: str, device: torch.device) -> Trainer:
-    folder = parsed.output / (parsed.name or f"{preset}-{time.strftime('%Y%m%d-%H%M%S')}")
+def _choose(arguments: list[str]) -> argparse.Namespace:
+    """Preset and resumed run decide the defaults of everything else, so they are read first."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--preset", default="flat")
+    parser.add_argument("--resume", type=Path, default=None)
+    return parser.parse_known_args(arguments)[0]
+
+
+def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
+    folder = parsed.output / (parsed.name or f"{parsed.preset}-{time.strftime('%Y%m%d-%H%M%S')}")
     if (folder / STATE_FILE).exists():
-        raise FileExistsError(f"{folder} already holds a run: continue it with --resume {folder}, or give another --name")
-    folder.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(parsed.config, folder)
+        raise FileExistsError(
+            f"{folder} already holds a run: continue it with --resume {folder}, or give another --name"
+        )
+    trainer = Trainer(replace(parsed.config, device=str(device)), folder)
     if parsed.warm_start:
-        path = _state_path(parsed.warm_start)
-        trainer.load_learning(torch.load(path, map_location="cpu", weights_only=True))
-    if distributed.rank() == 0:
-        write_run_description(folder, describe_run(parsed.config, preset))
+        trainer.load_learning(read_training_state(_state_path(parsed.warm_start)))
+    folder.mkdir(parents=True, exist_ok=True)
     return trainer
 
 
-def _resumed(folder: Path) -> Trainer:
-    from lowlevel.provenance import read_training_config
-
-    path = _state_path(folder)
-    trainer = Trainer(read_training_config(folder), folder)
+def _resumed(parsed: Arguments) -> Trainer:
+    assert parsed.resume is not None
+    path = _state_path(parsed.resume)
+    trainer = Trainer(parsed.config, parsed.resume)
     trainer.load(path)
     return trainer
 
@@ -104,5 +111,4 @@ def _state_path(folder: Path) -> Path:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     main()

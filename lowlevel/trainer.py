@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from pickle import UnpicklingError
 from types import FrameType
 from typing import Any
 
@@ -199,10 +200,7 @@ class Trainer:
         Raises:
             ValueError: if the file is damaged or belongs to another configuration.
         """
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-        except (RuntimeError, EOFError, OSError, ValueError) as error:
-            raise ValueError(f"{path} is not a readable training state: {error}") from error
+        state = read_training_state(path)
         self.load_learning(state)
         self.environment.load_state_dict(state["environment"])
         self.observation = state["observation"]
@@ -268,6 +266,19 @@ class Trainer:
                 yield log
             finally:
                 writer.close()
+
+
+def read_training_state(path: Path) -> dict[str, Any]:
+    """Contents of a training state; only tensors and plain values are ever unpickled.
+
+    Raises:
+        ValueError: if the file is damaged.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, OSError, ValueError, UnpicklingError) as error:
+        first_line = str(error).splitlines()[0]
+        raise ValueError(f"{path} is not a readable training state: {first_line}") from error
 
 
 def _tracking(result: StepResult) -> dict[str, Tensor]:

@@ -113,9 +113,11 @@ def test_estimator_learns_only_in_its_epochs_and_from_its_own_loss() -> None:
     for estimating in (True, False):
         ppo.storage.flat("history").normal_()
         samples, mirrored = ppo._samples(torch.arange(64), estimating)
-        losses = ppo.learner.losses(samples, mirrored, torch.full((4,), 0.5), estimating)
+        losses = ppo.learner.losses(samples, mirrored, None, torch.full((4,), 0.5), estimating)
         assert ("estimator" in losses) == estimating
         before = [p.clone() for p in ppo.learner.groups["estimator"]]
         ppo.learner.step(losses)
-        changed = [not torch.equal(a, b) for a, b in zip(before, ppo.learner.groups["estimator"], strict=True)]
+        changed = [
+            not torch.equal(a, b) for a, b in zip(before, ppo.learner.groups["estimator"], strict=True)
+        ]
         assert any(changed) == estimating

@@ -24,7 +24,7 @@ from lowlevel.learner import adapted_rate, clipped_surrogate
 from lowlevel.ppo import PPO, NonFiniteError, PPOConfig
 from lowlevel.symmetry import TensorMirrors
 
-SMALL = {"critic_learning_rate": 2e-3, "actor_learning_rate": 1e-3}
+SMALL = {"critic_learning_rate": 2e-3, "actor_learning_rate": 1e-3, "initial_std": 0.3}
 
 
 def test_clipped_surrogate_by_hand() -> None:
@@ -68,7 +68,7 @@ def test_kl_is_that_of_two_gaussians() -> None:
     new_std = ppo.actor.log_std.detach().exp()
     index = torch.arange(ppo.storage.size)
     samples, mirrored = ppo._samples(index, estimating=False)
-    losses = ppo.learner.losses(samples, mirrored, old_std, estimating=False)
+    losses = ppo.learner.losses(samples, mirrored, None, old_std, estimating=False)
     expected = torch.log(new_std / old_std) + (old_std**2 + 0.2**2) / (2 * new_std**2) - 0.5
     assert old_mean.shape == (384, 4)
     assert float(losses["kl"]) == pytest.approx(float(expected.sum()), rel=1e-4)
@@ -78,8 +78,8 @@ def test_kl_is_that_of_two_gaussians() -> None:
 def test_learns_to_track_a_linear_function_of_the_frame(symmetry: str) -> None:
     ppo = make_ppo(64, symmetry=symmetry, **SMALL)
     before = tracking_error(ppo)
-    figures = [run_update(ppo, seed) for seed in range(40)]
-    assert tracking_error(ppo) < 0.35 * before
+    figures = [run_update(ppo, seed) for seed in range(16)]
+    assert tracking_error(ppo) < 0.2 * before
     assert figures[-1]["kl"] < 0.05
     assert all(math.isfinite(number) for update in figures for number in update.values())
 
@@ -88,11 +88,11 @@ def test_symmetry_options_make_the_policy_more_symmetric() -> None:
     measured = {}
     for symmetry in ("none", "augmentation", "loss"):
         ppo = make_ppo(64, symmetry=symmetry, **SMALL)
-        for seed in range(15):
+        for seed in range(10):
             run_update(ppo, seed)
         measured[symmetry] = asymmetry(ppo)
-    assert measured["augmentation"] < 0.7 * measured["none"]
-    assert measured["loss"] < 0.3 * measured["none"]
+    assert measured["augmentation"] < 0.4 * measured["none"]
+    assert measured["loss"] < 0.4 * measured["none"]
 
 
 def test_mirror_images_start_at_ratio_one_even_if_the_policy_is_asymmetric() -> None:
@@ -119,6 +119,11 @@ def test_mirror_images_are_consistent_with_the_mirrors() -> None:
     assert mirrored == 5
     assert torch.equal(samples["action"][:5], storage.images("action")[:5])
     assert torch.equal(samples["action"][5:], storage.flat("action")[5:10])
+    images = ppo._images(torch.arange(12))
+    assert images is not None
+    assert torch.equal(
+        images["frame"], ppo.mirrors("history", storage.flat("history")[9:12])[:, -SIZES.frame :]
+    )
 
 
 def test_tensor_mirrors_check_what_they_are_given() -> None:
@@ -213,7 +218,8 @@ def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
         ppo.actor.log_std.fill_(5.0)
     ppo.storage.clear()
     run_update(ppo, 0)
-    assert ppo.actor.log_std.exp().max() == pytest.approx(0.4)
+    deviations = ppo.actor.log_std.detach().exp()
+    assert 0.2999 < float(deviations.min()) and float(deviations.max()) < 0.4001
 
 
 def test_bfloat16_hidden_layers_change_little() -> None:

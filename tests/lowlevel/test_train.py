@@ -1,0 +1,156 @@
+"""Training runs: learning, exact resume, crash safety and the command line."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from lowlevel.controller import Controller
+from lowlevel.environment import EnvironmentConfig
+from lowlevel.network_config import NetworkConfig
+from lowlevel.plain import from_plain
+from lowlevel.presets import PRESETS
+from lowlevel.provenance import describe_run, read_training_config, write_run_description
+from lowlevel.train import main
+from lowlevel.trainer import LOG_FILE, STATE_FILE, Trainer, TrainingConfig
+
+TINY_NETWORK = NetworkConfig(
+    history_hidden=(16,), map_hidden=8, map_global=4, expert_hidden=(16, 8), critic_hidden=(16,), target_hidden=(16,)
+)
+
+
+def tiny(**changes: object) -> TrainingConfig:
+    """A run small enough for a test."""
+    base = TrainingConfig(
+        environment=EnvironmentConfig(num_robots=8, num_threads=1),
+        network=TINY_NETWORK,
+        ppo=replace(TrainingConfig().ppo, steps_per_update=8, minibatches=2),
+    )
+    return replace(base, **changes)  # type: ignore[arg-type]
+
+
+def weights(trainer: Trainer) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in trainer.ppo.actor.parameters()])
+
+
+def run(trainer: Trainer, iterations: int) -> list[dict[str, float]]:
+    if not trainer.observation:
+        trainer.observation = trainer.environment.reset(spread_episodes=True)
+    return [trainer.iterate() for _ in range(iterations)]
+
+
+def without_clock(figures: dict[str, float]) -> dict[str, float]:
+    return {name: value for name, value in figures.items() if not name.startswith("speed/")}
+
+
+def test_resumed_run_is_bit_exact_over_twenty_updates(tmp_path: Path) -> None:
+    torch.set_num_threads(1)
+    unbroken = Trainer(tiny(), tmp_path)
+    run(unbroken, 3)
+    unbroken.save()
+    expected = run(unbroken, 20)
+    resumed = Trainer(tiny(seed=5), tmp_path)
+    resumed.load(tmp_path / STATE_FILE)
+    figures = run(resumed, 20)
+    assert torch.equal(weights(unbroken), weights(resumed))
+    assert [without_clock(f) for f in figures] == [without_clock(f) for f in expected]
+
+
+def test_same_seed_same_weights_other_seed_other_weights(tmp_path: Path) -> None:
+    trainers = [Trainer(tiny(seed=seed), tmp_path) for seed in (1, 1, 2)]
+    for trainer in trainers:
+        run(trainer, 2)
+    assert torch.equal(weights(trainers[0]), weights(trainers[1]))
+    assert not torch.equal(weights(trainers[0]), weights(trainers[2]))
+
+
+def test_reward_rises_in_a_short_run(tmp_path: Path) -> None:
+    """128 standing robots for 40 updates: the mean reward must rise clearly."""
+    config = replace(
+        tiny(),
+        environment=EnvironmentConfig(
+            num_robots=128, num_threads=2, mixture=replace(EnvironmentConfig().mixture, walk_and_work=0.0, stand_and_work=1.0)
+        ),
+        ppo=replace(TrainingConfig().ppo, steps_per_update=16, minibatches=4),
+    )
+    history = run(Trainer(config, tmp_path), 40)
+    rewards = [figures["reward/total"] for figures in history]
+    early, late = sum(rewards[8:16]) / 8, sum(rewards[-8:]) / 8
+    assert late > early + 0.2
+
+
+def test_configuration_survives_json(tmp_path: Path) -> None:
+    for preset, config in PRESETS.items():
+        description = describe_run(config, preset)
+        assert from_plain(TrainingConfig, json.loads(json.dumps(description["config"]))) == config
+    write_run_description(tmp_path, describe_run(PRESETS["no-moe"], "no-moe"))
+    assert read_training_config(tmp_path) == PRESETS["no-moe"]
+
+
+ARGUMENTS = [
+    "--environment.num-robots", "8", "--environment.num-threads", "1", "--ppo.steps-per-update", "8",
+    "--ppo.minibatches", "2", "--save-interval", "0",
+]  # fmt: skip
+
+
+def test_command_line_trains_exports_and_resumes(tmp_path: Path) -> None:
+    main([*ARGUMENTS, "--total-steps", "128", "--output", str(tmp_path), "--name", "run"])
+    folder = tmp_path / "run"
+    Controller.load(folder / "controller")
+    entries = [json.loads(line) for line in (folder / LOG_FILE).read_text().splitlines()]
+    assert [entry["steps"] for entry in entries] == [64, 128]
+    with pytest.raises(SystemExit, match="already holds a run"):
+        main([*ARGUMENTS, "--output", str(tmp_path), "--name", "run"])
+    main(["--resume", str(folder), "--total-steps", "192"])
+    entries = [json.loads(line) for line in (folder / LOG_FILE).read_text().splitlines()]
+    assert [entry["steps"] for entry in entries] == [64, 128, 192]
+
+
+def test_killed_run_resumes_from_its_last_save(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "lowlevel.train", *ARGUMENTS, "--output", str(tmp_path), "--name", "run"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
+    state = tmp_path / "run" / STATE_FILE
+    deadline = time.monotonic() + 60
+    while not state.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    trainer = Trainer(read_training_config(tmp_path / "run"), tmp_path / "run")
+    trainer.load(state)
+    assert trainer.steps > 0
+    run(trainer, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--preset", "stairs"], "unknown preset 'stairs'"),
+        (["--resume", "/nonexistent"], "/nonexistent holds no run.json"),
+        (["--warm-start", "/nonexistent"], "/nonexistent holds no training_state.pt"),
+        (["--output", "/proc/nowhere"], "/proc/nowhere"),
+        (["--environment.gains", "rubber"], "unknown gain set 'rubber'"),
+    ],
+)
+def test_bad_input_gives_one_sentence(arguments: list[str], message: str, tmp_path: Path) -> None:
+    output = [] if "--output" in arguments or "--resume" in arguments else ["--output", str(tmp_path)]
+    with pytest.raises(SystemExit) as exit_info:
+        main([*arguments, *output])
+    assert message in str(exit_info.value) and "\n" not in str(exit_info.value)
+
+
+def test_truncated_training_state_is_refused_and_left_alone(tmp_path: Path) -> None:
+    trainer = Trainer(tiny(), tmp_path)
+    path = trainer.save()
+    path.write_bytes(path.read_bytes()[:5000])
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="not a readable training state"):
+        Trainer(tiny(), tmp_path).load(path)
+    assert path.read_bytes() == before
