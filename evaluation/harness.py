@@ -27,7 +27,7 @@ from robots.g1.constants import DEFAULT_POSITION, FOOT_BODIES, GAINS, LOWER_JOIN
 from robots.g1.model import ModelOptions, build_spec
 
 BATCH = 32
-"""Robots side by side; always as many, as the last digits of a matrix product depend on its row count."""
+"""Robots side by side. The last digits of a matrix product, and with them a fall, depend on its row count."""
 TIMESTEP, DECIMATION = 0.002, 10
 """Physics step [s] and physics steps per control step of the evaluation protocol."""
 START_SPREAD = 1.0

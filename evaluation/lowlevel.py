@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import tyro
 
-from evaluation.harness import Arena, batch_steps
+from evaluation.harness import BATCH, Arena, batch_steps
 from evaluation.plots import plot_bars, plot_curves, plot_heat_map
 from evaluation.reports import (
     METRICS_FILE,
@@ -77,6 +77,8 @@ class Arguments:
     """Folder for report.md, metrics.json and plots; files of an earlier report there are replaced."""
     walk_episodes: int = WALK_EPISODES
     """Episodes of the walking test: 10 s at 0.5 m/s."""
+    robots: int = BATCH
+    """Robots side by side; the last digits of the figures depend on it."""
     threads: int = os.cpu_count() or 1
     """Physics threads."""
     write_metrics: bool = False
@@ -110,7 +112,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _run(arguments: Arguments) -> None:
-    for name in ("episodes", "walk_episodes", "threads"):
+    for name in ("episodes", "walk_episodes", "robots", "threads"):
         if getattr(arguments, name) < 1:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
     suite_terrain(arguments.suite)
@@ -135,7 +137,7 @@ def evaluate(controller: Controller, identity: str, arguments: Arguments) -> Eva
     began = time.monotonic()
     terrain = suite_terrain(arguments.suite)
     space, tiles, seed = controller.config.command_space, len(terrain.tiles), arguments.seed
-    arena = Arena(controller, terrain, num_threads=arguments.threads)
+    arena = Arena(controller, terrain, num_threads=arguments.threads, batch=arguments.robots)
     protocol = protocol_episodes(space, arguments.episodes, seed, tiles)
     walks = walking_episodes(space, arguments.walk_episodes, seed, tiles)
     modes = mode_episodes(space, seed)

@@ -35,9 +35,9 @@ class _Context(Protocol):
 
 @functools.cache
 def find_platform() -> str:
-    """The first of :data:`PLATFORMS` that works here; MUJOCO_GL, if it names one of them, is the only candidate.
+    """The first of :data:`PLATFORMS` that works here, or the one that MUJOCO_GL names if it works.
 
-    Each is tried in a process of its own, because a platform that fails spoils its process for the next one.
+    Each is tried in a process of its own, because one that fails spoils its process for the next.
 
     Raises:
         NoOpenGLError: if none does.

@@ -34,7 +34,7 @@ _FLOOR_HALF_SIZE = 15.0
 
 
 class Recorder:
-    """A stream to a file, to a viewer, or to both. A context manager: the file appears at the end of the block.
+    """A stream to a file, a viewer, or both. A context manager: the file appears at the end of the block.
 
     Args:
         path: the ``.rrd`` file, or None. An exception or Ctrl-C in the block leaves no file.
@@ -109,7 +109,9 @@ class Recorder:
         for body in range(1, model.nbody):
             if model.body_weldid[body] != 0:
                 w, x, y, z = data.xquat[body]
-                pose = rr.Transform3D(translation=data.xpos[body], quaternion=[x, y, z, w])
+                pose = rr.Transform3D(
+                    translation=data.xpos[body], quaternion=rr.Quaternion(xyzw=[x, y, z, w])
+                )
                 self.stream.log(_entity(model, body), pose)
 
     def name_series(self, path: str, names: list[str]) -> None:

@@ -89,8 +89,13 @@ def metrics(
 
 
 def write_metrics(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write ``metrics.json``; raises ValueError if a number is not finite."""
-    (folder / METRICS_FILE).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    """Write ``metrics.json``."""
+    write_json(folder / METRICS_FILE, content)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON; raises ValueError if a number is not finite."""
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:

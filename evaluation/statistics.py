@@ -80,3 +80,14 @@ def share_figure(happened: Sequence[bool] | np.ndarray) -> Figure:
     if len(flags) == 0:
         return Figure(None, "1", None, 0)
     return Figure(float(flags.mean()), "1", wilson_interval(int(flags.sum()), len(flags)), len(flags))
+
+
+def quantile_figure(samples: Sequence[float] | np.ndarray, quantile: float, unit: str) -> Figure:
+    """A quantile of independent samples, with the distribution-free interval between two order statistics."""
+    values = np.sort(np.asarray(samples, dtype=float))
+    count = len(values)
+    z = NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
+    spread = z * math.sqrt(count * quantile * (1.0 - quantile))
+    low, high = (round(count * quantile + shift) for shift in (-spread, spread))
+    ends = values[max(0, low)], values[min(count - 1, high)]
+    return Figure(float(np.quantile(values, quantile)), unit, (float(ends[0]), float(ends[1])), count)

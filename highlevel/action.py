@@ -1,8 +1,10 @@
-"""The planner's action: 21 numbers in [-1, 1] that become a bounded, rate-limited and feasible whole-body command.
+"""The planner's action: 21 numbers in [-1, 1] that become a bounded, rate-limited and feasible whole-body
+command.
 
-The paper names the planner's output, the command of 21 numbers, but neither its rate nor its bounds (IV-B-2). The
-numbers here are choices. An absolute target behind a rate limiter keeps the task Markov as long as the limited
-command is observed as the previous command, and it is; see :class:`highlevel.environment.CommandEnvironment`.
+The paper names the planner's output, the command of 21 numbers, but neither its rate nor its bounds (IV-B-2).
+The numbers here are choices. An absolute target behind a rate limiter keeps the task Markov as long as the
+limited command is observed as the previous command, and it is; see
+:class:`highlevel.environment.CommandEnvironment`.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ class ActionConfig:
     arm_center: _PER_ARM = (-0.65, 0.25, 0.1, 0.4, -0.1, 0.2, 0.0)
     """Nominal hold pose of the left arm in Unitree's order, mirrored for the right one [rad]."""
     arm_half_range: _PER_ARM = (1.1, 0.5, 0.5, 1.1, 0.5, 1.1, 0.5)
-    """Half range around it [rad]: from the arms at the sides over a grasp on the floor to a box held at the chest."""
+    """Half range around it [rad]: from the arms at the sides over a grasp on the floor to a box held at the
+    chest."""
     arm_rate: float = 2.0
     """[rad/s]"""
     decision_steps: int = 5
@@ -58,7 +61,9 @@ class ActionMap:
         control_period: of the controller [s].
     """
 
-    def __init__(self, config: ActionConfig, control_period: float, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, config: ActionConfig, control_period: float, device: torch.device | str = "cpu"
+    ) -> None:
         self.config = config
         arm_sign = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
         center, half = torch.tensor(config.arm_center), torch.tensor(config.arm_half_range)
@@ -73,7 +78,9 @@ class ActionMap:
             config.velocity_upper, config.height[1], torso_upper, (arm_center + arm_half).tolist(), device
         )
         torso_rate = (config.roll_yaw_rate, config.pitch_rate, config.roll_yaw_rate)
-        rate = _assemble(config.velocity_rate, config.height_rate, torso_rate, (config.arm_rate,) * 14, device)
+        rate = _assemble(
+            config.velocity_rate, config.height_rate, torso_rate, (config.arm_rate,) * 14, device
+        )
         self.largest_change = rate * config.decision_steps * control_period
         """Largest change of the command in one decision (21,)."""
 
@@ -96,7 +103,8 @@ class ActionMap:
 
 
 def interpolate(previous: Tensor, goal: Tensor, fraction: float) -> Tensor:
-    """The command (N, 21) after ``fraction`` of a decision, with velocities that mean standing still set to zero.
+    """The command (N, 21) after ``fraction`` of a decision, with velocities that mean standing still set to
+    zero.
 
     Training never showed the controller a velocity between zero and the standing threshold.
     """

@@ -1,7 +1,7 @@
 """Random numbers that depend on nothing but seed, episode and purpose.
 
-An episode is identified by its number. Its draws do not depend on how many robots run side by side, on which of
-them runs it, or on what was drawn before, so a list of numbered episodes is the same for every planner.
+An episode is identified by its number. Its draws do not depend on how many robots run side by side, on which
+of them runs it, or on what was drawn before, so a list of numbered episodes is the same for every planner.
 """
 
 from __future__ import annotations

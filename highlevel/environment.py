@@ -1,8 +1,9 @@
-"""N robots under one frozen controller, driven by whole-body commands. Read :meth:`CommandEnvironment.step` first.
+"""N robots under one frozen controller, driven by whole-body commands. Read :meth:`CommandEnvironment.step`
+first.
 
-One decision of the planner (10 Hz) is an option of five control steps (50 Hz), each of ten physics steps (500 Hz):
-the command is interpolated, the controller acts on fresh measurements at every control step, rewards add up, and an
-episode may end inside the option.
+One decision of the planner (10 Hz) is an option of five control steps (50 Hz), each of ten physics steps (500
+Hz): the command is interpolated, the controller acts on fresh measurements at every control step, rewards add
+up, and an episode may end inside the option.
 """
 
 from __future__ import annotations
@@ -21,7 +22,14 @@ from lowlevel.measures import Measurement, has_fallen, measure
 from lowlevel.rotations import conjugate, from_roll_pitch_yaw, multiply
 from lowlevel.simulation import BatchSimulation
 from lowlevel.terrain import Terrain, TerrainConfig
-from robots.g1.constants import DEFAULT_POSITION, JOINT_NAMES, LOWER_JOINTS, NUM_JOINTS, PELVIS_BODY, WAIST_JOINTS
+from robots.g1.constants import (
+    DEFAULT_POSITION,
+    JOINT_NAMES,
+    LOWER_JOINTS,
+    NUM_JOINTS,
+    PELVIS_BODY,
+    WAIST_JOINTS,
+)
 from robots.g1.model import ModelOptions, build_spec
 
 ROBOT_BLOCKS = (
@@ -31,8 +39,8 @@ ROBOT_BLOCKS = (
     ObservationBlock("joint_velocity", NUM_JOINTS, 5.0),
     ObservationBlock("previous_command", COMMAND_SIZE, 1.0),
 )
-"""The robot's part of the paper's planner observation: joint positions relative to the default pose, and the limited
-command in units of the action."""
+"""The robot's part of the paper's planner observation: joint positions relative to the default pose, and the
+limited command in units of the action."""
 START_CLEARANCE = 0.005
 """Height of the soles above the ground when an episode begins [m]."""
 
@@ -143,11 +151,12 @@ class CommandEnvironment:
         decimation = round(config.control_period / physics.timestep)
         if abs(decimation * physics.timestep - config.control_period) > 1e-9:
             raise ValueError(
-                f"the physics step {physics.timestep} s does not divide the control period {config.control_period} s"
+                f"the physics step {physics.timestep} s does not divide the control period "
+                f"{config.control_period} s"
             )
         return BatchSimulation(spec.compile(), num_envs, decimation, physics.num_threads)
 
-    # -- episodes ---------------------------------------------------------------------------------------------
+    # -- episodes --------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     def reset(self, seed: int | None = None) -> Tensor:
@@ -185,7 +194,7 @@ class CommandEnvironment:
         self.decisions[ids] = 0
         self.measured = measure(self.simulation.read(), self.terrain)
 
-    # -- stepping ---------------------------------------------------------------------------------------------
+    # -- stepping --------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     def step(self, action: Tensor, auto_reset: bool = True) -> StepResult:
@@ -226,7 +235,9 @@ class CommandEnvironment:
         elevation = self.terrain.elevation_map(self.measured.robot.base_position, self.measured.heading)
         for number in range(1, steps + 1):
             command = interpolate(previous, goal, number / steps)
-            self.simulation.step(self.controller.act(_proprioception(self.measured), elevation, command, self._flag))
+            self.simulation.step(
+                self.controller.act(_proprioception(self.measured), elevation, command, self._flag)
+            )
             self.measured = measure(self.simulation.read(), self.terrain)
             falls = has_fallen(self.measured, self.controller.reference) | self.simulation.diverged()
             outcome = self.task.step(self.measured, decision)

@@ -1,7 +1,7 @@
 """What a task is to the planner's environment, and how tasks are found by name.
 
-A task is a folder ``tasks/<name>/`` whose package has an attribute ``TASK``: a function without required arguments
-that returns a :class:`Task`. Nothing under ``highlevel`` knows a task by name.
+A task is a folder ``tasks/<name>/`` whose package has an attribute ``TASK``: a function without required
+arguments that returns a :class:`Task`. Nothing under ``highlevel`` knows a task by name.
 """
 
 from __future__ import annotations
@@ -67,10 +67,11 @@ class Decision:
 
 
 class Task(ABC):
-    """A task for N robots at once. The environment owns the robots, the task owns everything else in the scene.
+    """A task for N robots at once. The environment owns the robots, the task owns everything else in the
+    scene.
 
-    The order of calls: :meth:`add_to` once, :meth:`attach` once, then :meth:`reset` for robots that begin an episode and
-    :meth:`step` for all of them after every control step; :meth:`observe` at any time.
+    The order of calls: :meth:`add_to` once, :meth:`attach` once, then :meth:`reset` for robots that begin an
+    episode and :meth:`step` for all of them after every control step; :meth:`observe` at any time.
     """
 
     name: str
@@ -102,8 +103,8 @@ class Task(ABC):
     def reset(self, ids: Tensor, seed: int, episode: Tensor) -> Start:
         """Place the objects of robots ``ids`` (n,) for ``episode`` (n,) and say where the robots stand.
 
-        All randomness comes from :func:`highlevel.draws.uniform` with ``seed`` and ``episode``. The robots have
-        already been reset; the environment moves them and calls ``forward`` afterwards.
+        All randomness comes from :func:`highlevel.draws.uniform` with ``seed`` and ``episode``. The robots
+        have already been reset; the environment moves them and calls ``forward`` afterwards.
         """
 
     @abstractmethod
@@ -116,7 +117,8 @@ class Task(ABC):
 
     @abstractmethod
     def observe_additions(self, measured: Measurement, time_left: Tensor) -> Tensor:
-        """The :attr:`added_blocks` (N, ...) of the observation; ``time_left`` (N,) is a share of the episode."""
+        """The :attr:`added_blocks` (N, ...) of the observation; ``time_left`` (N,) is a share of the
+        episode."""
 
     @property
     @abstractmethod
@@ -125,14 +127,12 @@ class Task(ABC):
 
     @abstractmethod
     def failures(self, fallen: Tensor) -> list[str]:
-        """How each robot's episode would be classified if it ended now (N names), given who has ``fallen`` (N,)."""
+        """How each robot's episode would be classified if it ended now (N names), given who has ``fallen``
+        (N,)."""
 
     @abstractmethod
     def expert(self, environment: Any) -> Any:
-        """A scripted expert for a :class:`highlevel.environment.CommandEnvironment` of this task.
-
-        It has ``act(measured) -> action (N, 21)`` and ``reset(ids)``; see :mod:`highlevel.demonstrations`.
-        """
+        """A scripted :class:`highlevel.episodes.Policy` for a ``CommandEnvironment`` of this task."""
 
 
 def task_names() -> list[str]:

@@ -1,4 +1,5 @@
-"""All robots as one Stable-Baselines3 ``VecEnv``: one native physics call and one policy call per control step."""
+"""All robots as one Stable-Baselines3 ``VecEnv``: one native physics call and one policy call per control
+step."""
 
 from __future__ import annotations
 
@@ -17,8 +18,10 @@ from highlevel.gym_env import spaces
 class PlannerVecEnv(VecEnv):
     """Stable-Baselines3's view of a :class:`~highlevel.environment.CommandEnvironment`.
 
-    Episodes end with the entries that Stable-Baselines3 knows (``terminal_observation``, ``TimeLimit.truncated``,
-    ``episode``, ``is_success``) and ``stage`` and ``failure``. Robots whose episode goes on share empty infos.
+    Episodes end with the entries that Stable-Baselines3 knows (``terminal_observation``,
+    ``TimeLimit.truncated``,
+    ``episode``, ``is_success``) and ``stage`` and ``failure``. Robots whose episode goes on share empty
+    infos.
     """
 
     def __init__(self, environment: CommandEnvironment) -> None:
@@ -92,7 +95,9 @@ class PlannerVecEnv(VecEnv):
             raise ValueError(f"{attr_name!r} is shared by all robots: set it without indices")
         setattr(self.environment, attr_name, value)
 
-    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> list[Any]:
         """Call a method of the shared environment once and hand its result to every robot asked about."""
         result = getattr(self.environment, method_name)(*args, **kwargs)
         return [result for _ in self._get_indices(indices)]

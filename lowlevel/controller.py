@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from lowlevel.commands import COMMAND_SIZE, CommandSpace
+from lowlevel.commands import CommandSpace
 from lowlevel.files import atomic_write
+from lowlevel.golden import GOLDEN_ROBOTS, golden_vectors
 from lowlevel.networks import NetworkConfig, ObservationSizes, PilotActor
 from lowlevel.nominal import NominalConfig, NominalMotion, NominalState
 from lowlevel.observation import (
@@ -31,6 +32,7 @@ from lowlevel.observation import (
     FRAME_SIZE,
     HISTORY_LENGTH,
     FrameBuilder,
+    Proprioception,
     map_observation,
     normalised_columns,
     push_history,
@@ -38,7 +40,7 @@ from lowlevel.observation import (
 )
 from lowlevel.plain import from_plain
 from lowlevel.terrain import MAP_SIZE
-from robots.g1.constants import DEFAULT_POSITION, JOINT_NAMES, NUM_JOINTS, Gains
+from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
 
 FORMAT_VERSION = 1
@@ -52,20 +54,6 @@ CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
 
 class ControllerError(ValueError):
     """A controller folder cannot be used; the message says which file is at fault and why."""
-
-
-@dataclass(frozen=True)
-class Proprioception:
-    """What the controller measures on N robots."""
-
-    joint_position: Tensor
-    """(N, 29) [rad], Unitree's order."""
-    joint_velocity: Tensor
-    """(N, 29) [rad/s]."""
-    base_angular_velocity: Tensor
-    """(N, 3) [rad/s], pelvis frame."""
-    projected_gravity: Tensor
-    """Unit gravity direction in the pelvis frame (N, 3); (0, 0, -1) when upright."""
 
 
 @dataclass(frozen=True)
@@ -223,6 +211,30 @@ class Controller:
             raise RuntimeError("call reset() first")
         return self._memory.nominal.phase
 
+    def twin(self, num_robots: int) -> Controller:
+        """A controller on the CPU with copies of the weights and a fresh memory for ``num_robots`` robots."""
+        pose = self.motion.pose
+        tensors = [getattr(pose, name).cpu() for name in _POSE_TENSORS]
+        actor = PilotActor(self.actor.sizes, self.config.network, ~normalised_columns(FRAME))
+        actor.load_state_dict({name: tensor.cpu() for name, tensor in self.actor.state_dict().items()})
+        twin = Controller(self.config, actor, NominalPose(pose.axes, *tensors), self.provenance)
+        twin.reset(num_robots)
+        return twin
+
+    @property
+    def last_history(self) -> Tensor:
+        """Stacked frames (N, 6 * FRAME_SIZE) that the network saw last."""
+        if self._memory is None:
+            raise RuntimeError("call reset() first")
+        return self._memory.history.flatten(1)
+
+    @property
+    def last_action(self) -> Tensor:
+        """Residual action (N, 29) of the last step, in action scales."""
+        if self._memory is None:
+            raise RuntimeError("call reset() first")
+        return self._memory.action
+
     # -- folders ----------------------------------------------------------------------------------------------
 
     @classmethod
@@ -245,15 +257,16 @@ class Controller:
             raise ControllerError(f"{folder / CONFIG_FILE} is for a robot with other joints or another joint order")
         tensors = _read_weights(folder)
         actor = PilotActor(actor_sizes(), config.network, ~normalised_columns(FRAME))
-        pose_tensors = {name: tensors.pop(f"nominal_pose.{name}", None) for name in _POSE_TENSORS}
-        if any(tensor is None for tensor in pose_tensors.values()):
-            raise ControllerError(f"{folder / WEIGHTS_FILE} holds no nominal-pose table: export the controller again")
+        try:
+            pose_tensors = [tensors.pop(f"nominal_pose.{name}").to(device) for name in _POSE_TENSORS]
+        except KeyError as error:
+            raise ControllerError(f"{folder / WEIGHTS_FILE} has no {error}: export the controller again") from error
         try:
             actor.load_state_dict(tensors)
         except RuntimeError as error:
             first_line = str(error).splitlines()[-1].strip()
             raise ControllerError(f"{folder / WEIGHTS_FILE} does not fit {CONFIG_FILE}: {first_line}") from error
-        pose = NominalPose(config.pose_axes, *(pose_tensors[name].to(device) for name in _POSE_TENSORS))
+        pose = NominalPose(config.pose_axes, *pose_tensors)
         return cls(config, actor, pose, description["provenance"], device)
 
     def save(self, folder: Path | str, golden_seed: int = 0) -> None:
@@ -264,7 +277,7 @@ class Controller:
         weights = {name: tensor.cpu().contiguous() for name, tensor in self.actor.state_dict().items()}
         atomic_write(folder / WEIGHTS_FILE, lambda file: file.write(save(weights | pose)))
         export_onnx(self.actor, folder / ONNX_FILE)
-        golden = golden_vectors(self, golden_seed)
+        golden = golden_vectors(self.twin(GOLDEN_ROBOTS), self.config.command_space, golden_seed)
         atomic_write(folder / GOLDEN_FILE, lambda file: file.write(json.dumps(golden).encode()))
         description = {
             "format_version": FORMAT_VERSION,
@@ -325,58 +338,6 @@ def export_onnx(actor: PilotActor, path: Path) -> None:
     )
     assert program is not None
     atomic_write(path, lambda file: file.write(program.model_proto.SerializeToString()))
-
-
-def golden_vectors(controller: Controller, seed: int, steps: int = 3, robots: int = 4) -> dict[str, Any]:
-    """Random measurements and commands over a few control steps, with the targets that belong to them."""
-    generator = torch.Generator().manual_seed(seed)
-    lower, upper = controller.config.command_space.bounds()
-    twin = replace_memory(controller, robots)
-    records = []
-    for _ in range(steps):
-        position = torch.tensor(DEFAULT_POSITION, dtype=torch.float32) + 0.2 * torch.randn(
-            robots, NUM_JOINTS, generator=generator
-        )
-        gravity = torch.nn.functional.normalize(
-            torch.tensor([0.0, 0.0, -1.0]) + 0.1 * torch.randn(robots, 3, generator=generator), dim=-1
-        )
-        record = {
-            "joint_position": position,
-            "joint_velocity": torch.randn(robots, NUM_JOINTS, generator=generator),
-            "base_angular_velocity": 0.5 * torch.randn(robots, 3, generator=generator),
-            "projected_gravity": gravity,
-            "elevation_map": 0.75 + 0.05 * torch.randn(robots, MAP_SIZE, generator=generator),
-            "command": lower + (upper - lower) * torch.rand(robots, COMMAND_SIZE, generator=generator),
-            "flag": torch.ones(robots, 1),
-        }
-        record["targets"] = replay(twin, record)
-        assert twin._memory is not None
-        record["history"] = twin._memory.history.flatten(1)
-        record["action"] = twin._memory.action
-        records.append({name: value.tolist() for name, value in record.items()})
-    return {"robots": robots, "steps": records}
-
-
-def replay(controller: Controller, record: dict[str, Tensor]) -> Tensor:
-    """Targets (N, 29) of ``controller`` for one recorded step of golden vectors."""
-    measured = Proprioception(
-        record["joint_position"],
-        record["joint_velocity"],
-        record["base_angular_velocity"],
-        record["projected_gravity"],
-    )
-    return controller.act(measured, record["elevation_map"], record["command"], record["flag"])
-
-
-def replace_memory(controller: Controller, robots: int) -> Controller:
-    """A controller on the CPU with the same weights and a fresh memory for ``robots`` robots."""
-    pose = controller.motion.pose
-    cpu_pose = replace(pose, **{name: getattr(pose, name).cpu() for name in _POSE_TENSORS})
-    actor = PilotActor(controller.actor.sizes, controller.config.network, ~normalised_columns(FRAME))
-    actor.load_state_dict({name: tensor.cpu() for name, tensor in controller.actor.state_dict().items()})
-    twin = Controller(controller.config, actor, cpu_pose, controller.provenance)
-    twin.reset(robots)
-    return twin
 
 
 def _read_json(folder: Path, name: str) -> dict[str, Any]:

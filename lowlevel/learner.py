@@ -66,13 +66,13 @@ class PPOConfig:
     """Learning rate of the history encoder, the next-state encoder and the prototypes."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus [1/nat]."""
-    initial_std: float = 0.3
+    initial_std: float = 0.2
     """First standard deviation of the exploration noise [action units]."""
     std_bounds: tuple[float, float] = (0.05, 1.0)
     """Range of the exploration noise [action units]."""
     max_grad_norm: float = 1.0
     """Gradient norm to which each of the three groups is clipped."""
-    symmetry: Literal["none", "augmentation", "loss"] = "augmentation"
+    symmetry: Literal["none", "augmentation", "loss"] = "loss"
     """Penalise an asymmetric policy ("loss"), and also mirror half of every minibatch ("augmentation")."""
     mirror_loss_weight: float = 0.5
     """Weight of the symmetry loss, the KL divergence between the policy and its mirror image [1/nat]."""
@@ -178,12 +178,11 @@ class Learner:
         old_std: Tensor,
         estimating: bool,
     ) -> dict[str, Tensor]:
-        """Losses of the groups ("actor", "critic", "estimator" if ``estimating``) and figures to log, all
-        scalars.
+        """Losses "actor", "critic" and, if ``estimating``, "estimator", with figures to log; all scalars.
 
-        ``samples``: B rows per name. The first ``mirrored`` of them are mirror images, which the KL divergence
-        leaves out. ``images``: mirror images of the last rows, for the symmetry loss. ``old_std`` (A,) is the
-        noise of the policy that acted.
+        ``samples``: B rows per name. The first ``mirrored`` of them are mirror images, which the KL
+        divergence leaves out. ``images``: mirror images of the last rows, for the symmetry loss.
+        ``old_std`` (A,) is the noise of the policy that acted.
         """
         losses = self._actor_losses(samples, mirrored, images, old_std)
         with self.autocast():

@@ -82,7 +82,7 @@ class MapEncoder(nn.Module):
         samples = elevation_map.shape[0]
         pooled = (elevation_map @ self.pooling).unflatten(1, (self.windows, -1))
         weight = self.shared.weight.expand(samples, -1, -1)
-        features = functional.elu(torch.baddbmm(self.shared.bias[:, None], weight, pooled))
+        features = functional.elu(torch.baddbmm(self.shared.bias[:, None], weight, pooled), inplace=True)
         geometry = torch.cat([elevation_map.unsqueeze(1), self.coordinates.expand(samples, -1, -1)], dim=1)
         return features, geometry
 
@@ -93,9 +93,10 @@ class MapEncoder(nn.Module):
         projected = torch.bmm(queries, key_weight).transpose(0, 1) / math.sqrt(queries.shape[2])
         scores = torch.bmm(projected[:, :, self.features :], geometry)
         scores = torch.baddbmm(scores, projected[:, :, : self.features], features)
-        weights = torch.softmax(scores, dim=-1)
-        parts = [torch.bmm(weights, part.transpose(1, 2)) for part in (features, geometry)]
-        pooled = torch.cat(parts, dim=2).transpose(0, 1)
+        weights = torch.softmax(scores, dim=-1).transpose(1, 2)
+        pooled = torch.cat([torch.bmm(part, weights) for part in (features, geometry)], dim=1).permute(
+            2, 0, 1
+        )
         value_weight = self.value_weight.unflatten(0, (self.heads, -1))
         values = torch.bmm(pooled, value_weight.transpose(1, 2)).transpose(0, 1)
         return self.output(values.flatten(1) + self.value_bias)

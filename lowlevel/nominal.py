@@ -2,8 +2,8 @@
 
 The paper adds the policy's arm output to the commanded arm joints (III-B-2). Here the same is done for legs and
 waist, as additions to the paper: their nominal target comes from the nominal-pose table; a feed-forward march lifts
-the swing leg in time with a gait clock; and an ankle strategy leans against tilt, so that the zero action already
-stands. The training environment and the frozen controller share this module, so they cannot drift apart.
+the swing leg in time with a gait clock; and ankles and steps lean against tilt, so that the zero action already
+stands and marches. The training environment and the frozen controller share this module, so they cannot drift apart.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class NominalConfig:
     ``march``: the table plus a feed-forward march while walking."""
     gait_clock: bool = True
     """Show the gait clock to the policy (sine and cosine, zero while standing); an addition to the paper."""
-    gait_frequency: float = 1.4
+    gait_frequency: float = 2.0
     """Steps of one foot per second [Hz]."""
     height_rate: float = 0.5
     """Slew rate of the base height reference [m/s]."""
@@ -48,9 +48,9 @@ class NominalConfig:
     """Slew rate of the arm reference [rad/s]."""
     walking_ramp: float = 0.3
     """Time over which the march fades in and out [s]."""
-    knee_lift: float = 0.9
+    knee_lift: float = 0.8
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
-    lateral_shift: float = 0.10
+    lateral_shift: float = 0.05
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
     stride: float = 0.22
     """Hip swing per commanded velocity [rad per m/s, rad per rad/s]."""
@@ -58,6 +58,11 @@ class NominalConfig:
     """Ankle correction per tilt of the pelvis off its nominal attitude [rad/rad]; 0 switches the strategy off."""
     balance_damping: float = 0.2
     """Ankle correction per tilt rate [rad per rad/s]."""
+    step_stiffness: float = 1.5
+    """While marching: hip correction per tilt [rad/rad]; the swing foot steps towards the fall, the stance hip
+    rights the body."""
+    step_damping: float = 0.27
+    """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
 
 
 @dataclass
@@ -155,7 +160,7 @@ class NominalMotion:
             self._add_march(targets, state)
         if self.config.balance_stiffness > 0.0:
             attitude = self.pelvis_attitude(state.reference[:, TORSO], position[:, WAIST_JOINTS])
-            self._add_balance(targets, attitude, projected_gravity, base_angular_velocity)
+            self._add_balance(targets, state, attitude, projected_gravity, base_angular_velocity)
         return targets.clamp(self.lower, self.upper)
 
     def _add_march(self, targets: Tensor, state: NominalState) -> None:
@@ -179,12 +184,22 @@ class NominalMotion:
             for joint, offset in offsets.items():
                 targets[:, joint_index(f"{side}_{joint}_joint")] += offset
 
-    def _add_balance(self, targets: Tensor, attitude: Tensor, gravity: Tensor, angular_velocity: Tensor) -> None:
-        """Ankle strategy: both ankles push against the pelvis' tilt off its nominal ``attitude`` and its rate."""
+    def _add_balance(
+        self, targets: Tensor, state: NominalState, attitude: Tensor, gravity: Tensor, angular_velocity: Tensor
+    ) -> None:
+        """Lean against the pelvis' tilt off its nominal ``attitude`` with the ankles and, marching, with steps.
+
+        The capture point of a falling pendulum lies in the direction of tilt + rate * sqrt(height / g) (Pratt et al.,
+        Humanoids 2006), so the swing hip moves the foot that way.
+        """
+        config = self.config
         down = torch.zeros_like(gravity)
         down[:, 2] = -1.0
         tilt = torch.linalg.cross(gravity, rotate_inverse(attitude, down))
-        correction = self.config.balance_stiffness * tilt + self.config.balance_damping * angular_velocity
-        for axis, joint in ((0, "ankle_roll"), (1, "ankle_pitch")):
-            for side in ("left", "right"):
-                targets[:, joint_index(f"{side}_{joint}_joint")] += correction[:, axis]
+        ankle = config.balance_stiffness * tilt + config.balance_damping * angular_velocity
+        capture = config.step_stiffness * tilt + config.step_damping * angular_velocity
+        swing = torch.sin(state.phase) * state.walking
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            for axis, direction in ((0, "roll"), (1, "pitch")):
+                targets[:, joint_index(f"{side}_ankle_{direction}_joint")] += ankle[:, axis]
+                targets[:, joint_index(f"{side}_hip_{direction}_joint")] -= sign * swing * capture[:, axis]

@@ -89,6 +89,20 @@ def normalised_columns(blocks: tuple[Block, ...]) -> Tensor:
 
 
 @dataclass(frozen=True)
+class Proprioception:
+    """What the controller measures on N robots."""
+
+    joint_position: Tensor
+    """(N, 29) [rad], Unitree's order."""
+    joint_velocity: Tensor
+    """(N, 29) [rad/s]."""
+    base_angular_velocity: Tensor
+    """(N, 3) [rad/s], pelvis frame."""
+    projected_gravity: Tensor
+    """Unit gravity direction in the pelvis frame (N, 3); (0, 0, -1) when upright."""
+
+
+@dataclass(frozen=True)
 class NoiseConfig:
     """Half-widths of the uniform observation noise."""
 

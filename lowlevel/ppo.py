@@ -231,8 +231,8 @@ class PPO:
         """Add the mirror image of every sample, with its log-probability under the policy that acted.
 
         With the log-probability of the original instead, the first ratio of a mirrored sample would not be
-        one, and an asymmetric policy would diverge. With the one used here, mirrored samples move an action and
-        its mirror image alike and leave their difference as it is: that is what the symmetry loss is for.
+        one, and an asymmetric policy would diverge. With the one used here, mirrored samples move an action
+        and its mirror image alike and leave their difference as it is: that is what the symmetry loss is for.
         """
         for key in (*OBSERVATION_KEYS, "next_privileged", "action"):
             self.storage.images(key).copy_(self.mirrors(key, self.storage.flat(key)))

@@ -124,7 +124,7 @@ class Randomizer:
             state.push_countdown[ids] = self._uniform(*config.push_interval, count)
 
         friction = self.simulation.per_robot("geom_friction")
-        friction[np.ix_(rows, self._foot_geoms, [0])] = state.friction[ids].cpu().numpy()[:, :, None]
+        friction[rows[:, None], self._foot_geoms, 0] = state.friction[ids].cpu().numpy()
         if config.gain_scale != (1.0, 1.0):
             stiffness = self._uniform(*config.gain_scale, count, NUM_JOINTS).cpu().numpy()
             damping = self._uniform(*config.gain_scale, count, NUM_JOINTS).cpu().numpy()
@@ -139,7 +139,7 @@ class Randomizer:
         mass = self._nominal_mass + self.state.added_mass[ids].cpu().numpy()
         shift = self.config.center_of_mass_shift
         moved = self._uniform(-shift, shift, len(rows), len(self._bodies), 3).cpu().numpy()
-        cells = np.ix_(rows, self._bodies)
+        cells = (rows[:, None], self._bodies)
         self.simulation.per_robot("body_mass")[cells] = mass
         ratio = (mass / self._nominal_mass)[..., None]
         self.simulation.per_robot("body_inertia")[cells] = self._nominal_inertia * ratio

@@ -1,4 +1,5 @@
-"""Batched kinematics of waist and arms in torch: where the palms are, and which joints put them somewhere else.
+"""Batched kinematics of waist and arms in torch: where the palms are, and which joints put them somewhere
+else.
 
 The constants come from Pinocchio's model, the algebra is here because Pinocchio handles one robot at a time.
 """
@@ -28,7 +29,8 @@ class PalmPose:
     rotation: Tensor
     """(N, 2, 3, 3)"""
     jacobian: Tensor
-    """By the 7 arm joints (N, 2, 6, 7): velocity of the centre, then angular velocity, in the frame of ``position``."""
+    """By the 7 arm joints (N, 2, 6, 7): velocity of the centre, then angular velocity, in the frame of
+    ``position``."""
     shoulder: Tensor
     """First joint of each arm (N, 2, 3) [m]."""
 
@@ -69,7 +71,10 @@ class ArmKinematics:
             joints = [model.getJointId(name) for name in names]
             parents = [pelvis, *(data.oMi[joint] for joint in joints[:-1])]
             offsets.append(
-                [parent.actInv(data.oMi[joint]).homogeneous for parent, joint in zip(parents, joints, strict=True)]
+                [
+                    parent.actInv(data.oMi[joint]).homogeneous
+                    for parent, joint in zip(parents, joints, strict=True)
+                ]
             )
             axes.append([_axis(model.joints[joint]) for joint in joints])
             palms.append(data.oMi[joints[-1]].actInv(data.oMf[model.getFrameId(palm)]).translation)
@@ -77,7 +82,9 @@ class ArmKinematics:
         self._axes = torch.tensor(np.array(axes), dtype=torch.float32)
         self._skew = _skew(self._axes)
         self._palms = torch.tensor(np.array(palms), dtype=torch.float32)
-        limits = np.stack([model.lowerPositionLimit[7:][ARM_JOINTS], model.upperPositionLimit[7:][ARM_JOINTS]])
+        limits = np.stack(
+            [model.lowerPositionLimit[7:][ARM_JOINTS], model.upperPositionLimit[7:][ARM_JOINTS]]
+        )
         margin = np.array([[self.config.limit_margin], [-self.config.limit_margin]])
         self.lower, self.upper = torch.tensor(limits + margin, dtype=torch.float32)
 
@@ -105,7 +112,8 @@ class ArmKinematics:
     def inverse(
         self, waist: Tensor, start: Tensor, rest: Tensor, position: Tensor, rotation: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Arm joints that bring the palms to ``position`` (N, 2, 3) and ``rotation`` (N, 2, 3, 3), pelvis frame.
+        """Arm joints that bring the palms to ``position`` (N, 2, 3) and ``rotation`` (N, 2, 3, 3), pelvis
+        frame.
 
         Args:
             waist: waist joints (N, 3) [rad], which stay.
@@ -144,16 +152,20 @@ class ArmKinematics:
 
 
 def palm_rotation(forward: Tensor, finger_pitch: float, toe_in: float = 0.0) -> Tensor:
-    """Axes (N, 2, 3, 3) of palms that face each other, with the fingers along ``forward`` (N, 3), pitched down.
+    """Axes (N, 2, 3, 3) of palms that face each other, with the fingers along ``forward`` (N, 3), pitched
+    down.
 
-    ``forward`` is a horizontal unit vector; ``finger_pitch`` [rad] turns the fingers down, and ``toe_in`` [rad]
-    turns each hand about its thumb axis so that the fingers point at each other.
+    ``forward`` is a horizontal unit vector; ``finger_pitch`` [rad] turns the fingers down, and ``toe_in``
+    [rad] turns each hand about its thumb axis so that the fingers point at each other.
     """
     up = torch.zeros_like(forward)
     up[:, 2] = 1.0
     left = torch.linalg.cross(up, forward)
     world = torch.stack([forward, left, up], dim=-1)
-    turns = [pin.rpy.rpyToMatrix(0.0, finger_pitch, 0.0) @ pin.rpy.rpyToMatrix(0.0, 0.0, s * toe_in) for s in (-1.0, 1.0)]
+    turns = [
+        pin.rpy.rpyToMatrix(0.0, finger_pitch, 0.0) @ pin.rpy.rpyToMatrix(0.0, 0.0, s * toe_in)
+        for s in (-1.0, 1.0)
+    ]
     return world[:, None] @ torch.tensor(np.array(turns), dtype=torch.float32)
 
 

@@ -53,7 +53,8 @@ class Episode:
 
 
 def draw(config: LiftBoxConfig, seed: int, number: Tensor) -> tuple[Episode, Start]:
-    """Episodes ``number`` (n,): properties, and where the robots stand around a box at the origin with yaw zero.
+    """Episodes ``number`` (n,): properties, and where the robots stand around a box at the origin with yaw
+    zero.
 
     The robot faces the box's -x face: the box lies at +x of the robot but for bearing and yaw.
     """

@@ -1,8 +1,8 @@
 """A scripted expert: a state machine per robot, run for all robots at once, that produces planner actions.
 
 It shows that the controller can do the task before anything is learnt, gives the demonstrations, and is the
-baseline. It sees the true state, including contact forces. The numbers follow OmniContact's reference generator
-and DemoHLM's three segments (walk, reach in the object's frame, lift in the robot's frame).
+baseline. It sees the true state, including contact forces. The numbers follow OmniContact's reference
+generator and DemoHLM's three segments (walk, reach in the object's frame, lift in the robot's frame).
 """
 
 from __future__ import annotations
@@ -14,14 +14,13 @@ from torch import Tensor
 
 from highlevel.environment import CommandEnvironment
 from highlevel.task import rows
-from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, TORSO, VELOCITY
+from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.measures import Measurement
 from lowlevel.rotations import rotate, rotate_about_vertical, rotate_inverse, yaw_of
 from robots.g1.constants import ARM_JOINTS, WAIST_JOINTS
 from tasks.lift_box.arms import ArmKinematics, palm_rotation
 from tasks.lift_box.geometry import Situation
 from tasks.lift_box.reward import PALM_BELOW_TOP, grasp_posture
-from tasks.lift_box.scene import BOX
 from tasks.lift_box.task import LiftBox
 
 WALK, STOP, DESCEND, CLOSE, LIFT, HOLD = range(6)
@@ -126,7 +125,9 @@ class LiftBoxExpert:
         config: how it moves.
     """
 
-    def __init__(self, environment: CommandEnvironment, task: LiftBox, config: ExpertConfig | None = None) -> None:
+    def __init__(
+        self, environment: CommandEnvironment, task: LiftBox, config: ExpertConfig | None = None
+    ) -> None:
         self.config = ExpertConfig() if config is None else config
         self._environment, self._task = environment, task
         self._period = environment.decision_period
@@ -160,12 +161,12 @@ class LiftBoxExpert:
         memory.arms[ids] = self._neutral[ARMS]
 
     @torch.no_grad()
-    def act(self) -> Tensor:
-        """The next action (N, 21)."""
+    def act(self, observation: Tensor) -> Tensor:
+        """The next action (N, 21); it depends on the state of the environment, not on ``observation``."""
         measured = self._environment.measured
         if measured is None:
             raise RuntimeError("reset the environment before asking the expert")
-        situation = self._task._look(measured)
+        situation = self._task.look(measured)
         self._advance(measured, situation)
         command = self._neutral.repeat(len(self.phase), 1)
         command[:, VELOCITY] = self._velocity(measured, situation)
@@ -175,7 +176,7 @@ class LiftBoxExpert:
         command[:, ARMS] = self._arm_targets(measured, situation)
         return self._environment.action_map.action(command)
 
-    # -- state machine ----------------------------------------------------------------------------------------
+    # -- state machine ---------------------------------------------------------------------------------------
 
     def _advance(self, measured: Measurement, situation: Situation) -> None:
         config, memory, period = self.config, self._memory, self._period
@@ -208,7 +209,9 @@ class LiftBoxExpert:
 
         down_step, up_step = period / config.descend_time, period / config.lift_time
         change = torch.where(
-            following == DESCEND, down_step, torch.where(following == LIFT, -up_step, torch.zeros_like(memory.descent))
+            following == DESCEND,
+            down_step,
+            torch.where(following == LIFT, -up_step, torch.zeros_like(memory.descent)),
         )
         memory.descent = (memory.descent + change).clamp(0.0, 1.0)
         closing = (following == CLOSE).float() * config.close_speed * period
@@ -218,12 +221,14 @@ class LiftBoxExpert:
         step = torch.where(following >= CLOSE, step, torch.zeros_like(step))
         memory.depth = (memory.depth + step).clamp(-config.clearance, config.deepest)
 
-    # -- legs -------------------------------------------------------------------------------------------------
+    # -- legs ------------------------------------------------------------------------------------------------
 
     def _stand_error(self, measured: Measurement, situation: Situation) -> tuple[Tensor, Tensor]:
         """Where to stand from the feet: position (N, 2) [m] in the heading frame, and yaw (N,) [rad]."""
         box_yaw = situation.yaw_error
-        back = rotate_about_vertical(box_yaw, torch.tensor([-self.config.stand_off, 0.0]).expand(len(box_yaw), 2))
+        back = rotate_about_vertical(
+            box_yaw, torch.tensor([-self.config.stand_off, 0.0]).expand(len(box_yaw), 2)
+        )
         return self._near_face_from_feet(measured, situation) + back, box_yaw
 
     def _near_face_from_feet(self, measured: Measurement, situation: Situation) -> Tensor:
@@ -268,7 +273,7 @@ class LiftBoxExpert:
         height = torch.where(memory.phase <= STOP, self._neutral[HEIGHT], height)
         return height, share * bent
 
-    # -- arms -------------------------------------------------------------------------------------------------
+    # -- arms ------------------------------------------------------------------------------------------------
 
     def _arm_targets(self, measured: Measurement, situation: Situation) -> Tensor:
         """Arm joints (N, 14) that put the palms where the phase wants them, given the torso as it is."""
@@ -300,7 +305,9 @@ class LiftBoxExpert:
         offset = side[None, :, None] * (apart + 0.012)[:, None, None] * left[:, None]
         target = middle[:, None] + offset
         target = self._within_reach(target, measured)
-        error = middle[:, None] + side[None, :, None] * apart[:, None, None] * left[:, None] - robot.palm_position
+        error = (
+            middle[:, None] + side[None, :, None] * apart[:, None, None] * left[:, None] - robot.palm_position
+        )
         self._correct(error)
 
         pelvis_frame = robot.base_quaternion[:, None].expand(-1, 2, -1)
@@ -328,7 +335,8 @@ class LiftBoxExpert:
     def _within_reach(self, target: Tensor, measured: Measurement) -> Tensor:
         """Draw targets (N, 2, 3) that lie farther from the shoulders than the arms are long towards them.
 
-        They keep their distance from the sagittal plane of the target, so that the hands come down beside the box.
+        They keep their distance from the sagittal plane of the target, so that the hands come down beside the
+        box.
         """
         robot = measured.robot
         pose = self._arms.forward(robot.joint_position[:, WAIST_JOINTS], robot.joint_position[:, ARM_JOINTS])

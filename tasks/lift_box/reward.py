@@ -1,7 +1,7 @@
 """Staged reward: progress of a potential in which every passed stage is saturated, plus costs.
 
-The form is that of MuJoCo Playground's AlohaHandOver: max(potential - best so far, 0) plus a small stream of the
-potential itself. The success bonus exceeds what the stream would pay for never finishing.
+The form is that of MuJoCo Playground's AlohaHandOver: max(potential - best so far, 0) plus a small stream of
+the potential itself. The success bonus exceeds what the stream would pay for never finishing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from tasks.lift_box.stages import APPROACH, GRASP, REACH, Progress
 STAND_OFF = 0.30
 """Distance of the near face ahead of the pelvis that the approach aims at [m]."""
 PALM_BELOW_TOP = 0.07
-"""Where the palms go, below the top edge [m]: any lower and the forearms touch the faces before the palms do."""
+"""Where the palms go, below the top edge [m]: any lower and the forearms touch the faces before the palms
+do."""
 
 
 def grasp_posture(palm_height: Tensor) -> tuple[Tensor, Tensor]:
@@ -74,7 +75,8 @@ def potential(
 
 
 def costs(situation: Situation, progress: Progress, change: Tensor, rewards: RewardConfig) -> Tensor:
-    """Costs of one decision (N,), not positive; ``change`` (N, 21) is the command's change over the largest change."""
+    """Costs of one decision (N,), not positive; ``change`` (N, 21) is the command's change over the largest
+    change."""
     moved = (situation.box_pose[:, :2] - progress.start_position).norm(dim=-1)
     excess = (situation.palm_force - rewards.force_limit).clamp_min(0.0).sum(dim=1)
     before_grasp = (progress.stage < GRASP).float()

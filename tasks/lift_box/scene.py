@@ -1,7 +1,7 @@
 """The lift-box scene: a box, the block it stands on, what of the robot may touch it, and the sensors between.
 
-The box starts at the origin of every simulation and the robots are placed around it, so that the block beneath
-needs only a height.
+The box starts at the origin of every simulation and the robots are placed around it, so that the block
+beneath needs only a height.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def add_box_scene(spec: mujoco.MjSpec) -> None:
     shell.pos, shell.size = [0.0, 0.0, 0.14], [0.075, 0.11, 0.16]
     shell.mass, shell.contype, shell.conaffinity, shell.group = 0.0, 0, 0, 3
     for part in _BLOCKERS:
-        # Without friction: the rest of the body may be in the way of the box, but only the palms may carry it.
+        # Without friction: the rest of the body may be in the way of the box, but only the palms carry it.
         spec.add_pair(geomname1=part, geomname2=BOX, condim=1)
     for hand, name in zip(HAND_BODIES, FORCE_SENSORS, strict=True):
         sensor = spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT)

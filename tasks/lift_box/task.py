@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict
 from typing import Any
 
@@ -54,7 +55,8 @@ class LiftBox(Task):
         self.fall_penalty = self.config.rewards.fall
 
     def describe(self) -> dict[str, Any]:
-        return asdict(self.config)
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self.config)))
+        return plain
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         add_box_scene(spec)
@@ -70,7 +72,7 @@ class LiftBox(Task):
         self._seed = 0
         self._control_steps = torch.zeros(count, dtype=torch.long)
 
-    # -- episodes ---------------------------------------------------------------------------------------------
+    # -- episodes --------------------------------------------------------------------------------------------
 
     def reset(self, ids: Tensor, seed: int, episode: Tensor) -> Start:
         drawn, start = draw(self.config, seed, episode)
@@ -98,7 +100,7 @@ class LiftBox(Task):
     def step(self, measured: Measurement, decision: Decision) -> Outcome:
         rewards, stages, period = self.config.rewards, self.config.stages, self._simulation.control_period
         self._control_steps += 1
-        situation = self.situation = self._look(measured)
+        situation = self.situation = self.look(measured)
         support = self.episode.support_height
         advance(self.progress, situation, support, stages, period)
         success = self.progress.stage >= HOLD
@@ -112,7 +114,7 @@ class LiftBox(Task):
         reward = reward + rewards.success * success + rewards.drop * dropped
         return Outcome(reward, success, dropped)
 
-    def _look(self, measured: Measurement) -> Situation:
+    def look(self, measured: Measurement) -> Situation:
         # The sensor reports the force that the box exerts on the palm's side of the pair; see the tests.
         force = torch.stack([self._simulation.sensor(name) for name in FORCE_SENSORS], dim=1)
         return observe_situation(measured, self._simulation.object_pose(BOX), self.episode.size, force)
@@ -128,7 +130,7 @@ class LiftBox(Task):
         columns = zip(self.progress.stage.tolist(), fallen.tolist(), self._dropped().tolist(), strict=True)
         return [failure_name(*row) for row in columns]
 
-    # -- observation ------------------------------------------------------------------------------------------
+    # -- observation -----------------------------------------------------------------------------------------
 
     def observe_object(self, measured: Measurement) -> Tensor:
         robot = measured.robot
@@ -139,7 +141,7 @@ class LiftBox(Task):
         return torch.cat([position + shift, six_numbers(quaternion)], -1)
 
     def observe_additions(self, measured: Measurement, time_left: Tensor) -> Tensor:
-        situation = self._look(measured)
+        situation = self.look(measured)
         current = self.progress.stage.clamp(max=len(STAGES) - 1)
         return torch.cat(
             [

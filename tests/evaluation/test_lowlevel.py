@@ -192,7 +192,7 @@ def test_command_writes_a_report(
     folder = tmp_path / "controller"
     shutil.copytree(untrained_controller, folder)
     output = tmp_path / "results" / "report"
-    options = ["--episodes", "2", "--walk-episodes", "1", "--seed", "5", "--write-metrics"]
+    options = ["--episodes", "2", "--walk-episodes", "1", "--seed", "5", "--robots", "2", "--write-metrics"]
     main(["--controller", str(folder), "--output", str(output), *options])
     assert {file.name for file in output.iterdir()} == {
         "report.md",

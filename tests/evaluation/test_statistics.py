@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.statistics import mean_figure, mean_interval, share_figure, wilson_interval
+from evaluation.statistics import mean_figure, mean_interval, quantile_figure, share_figure, wilson_interval
 
 
 @pytest.mark.parametrize(
@@ -75,3 +75,15 @@ def test_share_figure() -> None:
     assert figure.value == pytest.approx(0.9) and figure.n == 100
     assert figure.ci95 == wilson_interval(90, 100)
     assert share_figure([]).value is None
+
+
+def test_quantile_interval_covers_the_quantile() -> None:
+    rng = np.random.default_rng(3)
+    truth = -np.log(0.1)
+    hits = []
+    for _ in range(200):
+        figure = quantile_figure(rng.exponential(size=400), 0.9, "ms")
+        assert figure.ci95 is not None and figure.value is not None
+        assert figure.ci95[0] <= figure.value <= figure.ci95[1]
+        hits.append(figure.ci95[0] <= truth <= figure.ci95[1])
+    assert 0.9 <= np.mean(hits) <= 0.99

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 import torch
@@ -36,7 +37,7 @@ def test_a_writer_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "state"
     path.write_bytes(b"old")
 
-    def fail(file) -> None:  # type: ignore[no-untyped-def]
+    def fail(file: BinaryIO) -> None:
         file.write(b"half")
         raise RuntimeError("disk on fire")
 
@@ -52,6 +53,7 @@ def test_kill_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
     program = """
 import sys, time
 from pathlib import Path
+from typing import BinaryIO
 from lowlevel.files import atomic_write
 
 def write(file):

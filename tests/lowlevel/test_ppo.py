@@ -24,7 +24,7 @@ from lowlevel.learner import adapted_rate, clipped_surrogate
 from lowlevel.ppo import PPO, NonFiniteError, PPOConfig
 from lowlevel.symmetry import TensorMirrors
 
-SMALL = {"critic_learning_rate": 2e-3, "actor_learning_rate": 1e-3, "initial_std": 0.3}
+FAST = {"critic_learning_rate": 2e-3, "actor_learning_rate": 1e-3, "initial_std": 0.3}
 
 
 def test_clipped_surrogate_by_hand() -> None:
@@ -74,25 +74,18 @@ def test_kl_is_that_of_two_gaussians() -> None:
     assert float(losses["kl"]) == pytest.approx(float(expected.sum()), rel=1e-4)
 
 
-@pytest.mark.parametrize("symmetry", ["none", "augmentation", "loss"])
-def test_learns_to_track_a_linear_function_of_the_frame(symmetry: str) -> None:
-    ppo = make_ppo(64, symmetry=symmetry, **SMALL)
-    before = tracking_error(ppo)
-    figures = [run_update(ppo, seed) for seed in range(16)]
-    assert tracking_error(ppo) < 0.2 * before
-    assert figures[-1]["kl"] < 0.05
-    assert all(math.isfinite(number) for update in figures for number in update.values())
-
-
-def test_symmetry_options_make_the_policy_more_symmetric() -> None:
-    measured = {}
+def test_learns_to_track_a_linear_function_of_the_frame_and_symmetry_options_keep_it_symmetric() -> None:
+    asymmetries = {}
     for symmetry in ("none", "augmentation", "loss"):
-        ppo = make_ppo(64, symmetry=symmetry, **SMALL)
-        for seed in range(10):
-            run_update(ppo, seed)
-        measured[symmetry] = asymmetry(ppo)
-    assert measured["augmentation"] < 0.4 * measured["none"]
-    assert measured["loss"] < 0.4 * measured["none"]
+        ppo = make_ppo(64, symmetry=symmetry, **FAST)
+        before = tracking_error(ppo)
+        figures = [run_update(ppo, seed) for seed in range(7)]
+        assert tracking_error(ppo) < 0.5 * before, symmetry
+        assert all(math.isfinite(number) for update in figures for number in update.values())
+        assert ("asymmetry" in figures[0]) == (symmetry != "none")
+        asymmetries[symmetry] = asymmetry(ppo)
+    assert asymmetries["augmentation"] < 0.4 * asymmetries["none"]
+    assert asymmetries["loss"] < 0.4 * asymmetries["none"]
 
 
 def test_mirror_images_start_at_ratio_one_even_if_the_policy_is_asymmetric() -> None:
@@ -219,7 +212,7 @@ def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
     ppo.storage.clear()
     run_update(ppo, 0)
     deviations = ppo.actor.log_std.detach().exp()
-    assert 0.2999 < float(deviations.min()) and float(deviations.max()) < 0.4001
+    assert float(deviations.min()) > 0.2999 and float(deviations.max()) < 0.4001
 
 
 def test_bfloat16_hidden_layers_change_little() -> None:

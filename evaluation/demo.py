@@ -1,0 +1,248 @@
+"""``run-demo``: one autonomous episode, recorded for the rerun viewer or watched live."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import mujoco
+import numpy as np
+import torch
+import tyro
+
+from evaluation.highlevel import SCRIPTED, make_policy
+from evaluation.pictures import NoOpenGLError, Painter, following_camera, save_picture
+from evaluation.recording import EpisodeRecording, Recorder
+from evaluation.reports import (
+    REPORT_FILE,
+    check_output,
+    markdown_table,
+    progress_bar,
+    run_command,
+    write_json,
+    write_results,
+)
+from evaluation.visuals import VisualTwin
+from highlevel.action import interpolate
+from highlevel.environment import CommandEnvironment, PhysicsConfig, StepResult
+from highlevel.planner import Planner, planner_hash
+from highlevel.registration import find_controller
+from highlevel.task import Decision, Outcome, Task, load_task, rows
+from lowlevel.controller import Controller, content_hash
+from lowlevel.measures import Measurement
+
+RECORDING_FILE, OUTCOME_FILE = "episode.rrd", "outcome.json"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Run one autonomous episode of a task and record it."""
+
+    planner: str
+    """Planner folder, or "scripted" for the task's scripted expert."""
+    task: str = "lift_box"
+    """Name of the task."""
+    controller: Path | None = None
+    """Controller folder; the shipped one if there is only one."""
+    seed: int = 0
+    """Seed of the episodes."""
+    episode: int = 0
+    """Number of the episode, as in an evaluation's report."""
+    live: bool = False
+    """Also show the episode in a rerun viewer while it runs."""
+    pictures: bool = True
+    """Also render a picture at the start, at every stage and at the end, where OpenGL works."""
+    output: Path = Path("runs/demo")
+    """Folder for the recording, report.md and pictures; files of an earlier demo there are replaced."""
+    threads: int = os.cpu_count() or 1
+    """Threads of the physics."""
+
+
+@dataclass(frozen=True)
+class Story:
+    """How an episode went."""
+
+    success: bool
+    failure: str | None
+    """Why it failed; None for a success."""
+    duration: float
+    """[s]"""
+    stage_times: dict[str, float]
+    """When each stage was passed [s]."""
+    instants: dict[str, np.ndarray]
+    """Coordinates of the scene at the start, at every stage and at the end."""
+
+
+class WatchedTask:
+    """A task that shows every control step to ``see``; everything else is the task's own."""
+
+    def __init__(self, task: Task, see: Callable[[Measurement, Decision], None]) -> None:
+        self._task, self._see = task, see
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._task, name)
+
+    def step(self, measured: Measurement, decision: Decision) -> Outcome:
+        """Judge one control step, then show it."""
+        outcome = self._task.step(measured, decision)
+        self._see(measured, decision)
+        return outcome
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of ``run-demo``."""
+    parsed = tyro.cli(Arguments, args=arguments)
+    run_command("run-demo", lambda: _run(parsed))
+
+
+def _run(arguments: Arguments) -> None:
+    if arguments.episode < 0 or arguments.threads < 1:
+        raise ValueError("--episode must not be negative and --threads must be at least 1")
+    load_task(arguments.task)
+    check_output(arguments.output)
+    folder = find_controller(arguments.controller)
+    Controller.load(folder)
+    if arguments.planner != SCRIPTED:
+        Planner.load(arguments.planner, folder)
+    torch.set_num_threads(1)
+    print(f"running {arguments.planner} on {arguments.task}, episode {arguments.episode}", flush=True)
+    stories: list[Story] = []
+
+    def write(output: Path) -> None:
+        story, twin = run_episode(arguments, folder, output / RECORDING_FILE)
+        pictures = _draw(twin, story, output) if arguments.pictures else []
+        (output / REPORT_FILE).write_text(report_text(arguments, story, folder, pictures))
+        outcome = {name: value for name, value in asdict(story).items() if name != "instants"}
+        write_json(output / OUTCOME_FILE, outcome | identities(arguments, folder))
+        stories.append(story)
+
+    write_results(arguments.output, write)
+    print(outcome_text(stories[0]))
+    print(f"recording: {arguments.output / RECORDING_FILE}   report: {arguments.output / REPORT_FILE}")
+    print(f"watch it with: rerun {arguments.output / RECORDING_FILE}")
+
+
+def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tuple[Story, VisualTwin]:
+    """Run the episode and write the ``recording``; also returns the scene's visual double."""
+    control_steps = 0
+    stage_times: dict[str, float] = {}
+    instants: dict[str, np.ndarray] = {}
+
+    def see(measured: Measurement, decision: Decision) -> None:
+        nonlocal control_steps
+        in_decision = control_steps % task.action.decision_steps + 1
+        control_steps += 1
+        seconds = control_steps * environment.control_period
+        passed = int(task.stage[0])
+        for stage in task.stages[len(stage_times) : passed]:
+            stage_times[stage] = seconds
+            instants[stage] = environment.simulation.robot_data(0).qpos.copy()
+        elevation = environment.terrain.elevation_map(measured.robot.base_position, measured.heading)
+        fraction = in_decision / task.action.decision_steps
+        film.add(
+            time=seconds,
+            simulation=environment.simulation,
+            row=0,
+            measured=measured,
+            command=interpolate(decision.previous, decision.goal, fraction),
+            gate=environment.controller.gate,
+            elevation=elevation,
+            stage=f"towards {task.stages[passed]}" if passed < len(task.stages) else "done",
+        )
+
+    task = load_task(arguments.task)
+    physics = PhysicsConfig(num_threads=arguments.threads)
+    environment = CommandEnvironment(cast(Task, WatchedTask(task, see)), controller, physics=physics)
+    policy = make_policy(arguments.planner, environment, controller)
+    observation = environment.reset(arguments.seed)
+    for _ in range(arguments.episode):
+        observation = environment.reset()
+    policy.reset(rows(1))
+    instants["start"] = environment.simulation.robot_data(0).qpos.copy()
+
+    def add_surroundings(spec: mujoco.MjSpec) -> None:
+        environment.terrain.add_to(spec)
+        task.add_to(spec)
+
+    twin = VisualTwin(add_surroundings)
+    twin.adopt_sizes(environment.simulation, 0)
+    network = environment.controller.config.network
+    result: StepResult | None = None
+    with Recorder(recording, arguments.live) as recorder, progress_bar() as progress:
+        bar = progress.add_task("episode", total=environment.max_decisions)
+        film = EpisodeRecording(recorder, twin, network.experts if network.mixture else 1)
+        while result is None or not bool(result.done[0]):
+            result = environment.step(policy.act(observation), auto_reset=False)
+            observation = result.observation
+            progress.update(bar, advance=1)
+    instants["end"] = environment.simulation.robot_data(0).qpos.copy()
+    story = Story(
+        success=bool(result.success[0]),
+        failure=result.failures.get(0),
+        duration=float(result.duration[0]),
+        stage_times=stage_times,
+        instants=instants,
+    )
+    return story, twin
+
+
+def _draw(twin: VisualTwin, story: Story, output: Path) -> list[str]:
+    """Draw all instants; returns the names of the pictures, none if this machine cannot render."""
+    names = []
+    try:
+        with Painter(twin.model) as painter:
+            for number, (instant, position) in enumerate(story.instants.items()):
+                twin.data.qpos[:] = position
+                mujoco.mj_forward(twin.model, twin.data)
+                names.append(f"{number}_{instant}.png")
+                save_picture(
+                    output / names[-1], painter.draw(twin.data, following_camera(twin.model, twin.data))
+                )
+    except NoOpenGLError as error:
+        print(error)
+    return names
+
+
+def identities(arguments: Arguments, controller: Path) -> dict[str, str | int]:
+    """What made the episode."""
+    scripted = arguments.planner == SCRIPTED
+    return {
+        "task": arguments.task,
+        "seed": arguments.seed,
+        "episode": arguments.episode,
+        "controller": content_hash(controller),
+        "planner": SCRIPTED if scripted else planner_hash(arguments.planner),
+    }
+
+
+def outcome_text(story: Story) -> str:
+    """The outcome in one line."""
+    if story.success:
+        return f"success after {story.duration:.1f} s"
+    last = (
+        f"after the stage {list(story.stage_times)[-1]!r}" if story.stage_times else "before the first stage"
+    )
+    return f"failure ({story.failure}) after {story.duration:.1f} s, {last}"
+
+
+def report_text(arguments: Arguments, story: Story, controller: Path, pictures: list[str]) -> str:
+    """``report.md``."""
+    made_by = identities(arguments, controller)
+    stages = [[stage, f"{seconds:.2f}"] for stage, seconds in story.stage_times.items()]
+    lines = [
+        f"# {arguments.task.replace('_', ' ').capitalize()}: {outcome_text(story)}",
+        "",
+        f"Planner `{made_by['planner']}` on controller `{made_by['controller']}`, seed {arguments.seed}, "
+        f"episode {arguments.episode}. Recording: `{RECORDING_FILE}`, open it with `rerun {RECORDING_FILE}`.",
+        "",
+        markdown_table(["stage passed", "time [s]"], stages) if stages else "No stage was passed.\n",
+    ]
+    return "\n".join([*lines, *(f"![{name}]({name})" for name in pictures), ""])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

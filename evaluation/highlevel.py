@@ -1,0 +1,328 @@
+"""``evaluate-highlevel``: how often a planner, or the scripted expert, completes a task, and why it fails."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections import Counter
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import torch
+import tyro
+
+from evaluation.plots import plot_bars
+from evaluation.reports import (
+    METRICS_FILE,
+    REPORT_FILE,
+    check_output,
+    format_figure,
+    markdown_table,
+    metrics,
+    progress_bar,
+    run_command,
+    write_json,
+    write_metrics,
+    write_results,
+)
+from evaluation.statistics import Figure, mean_figure, share_figure
+from highlevel.environment import CommandEnvironment, PhysicsConfig
+from highlevel.episodes import EpisodeRecord, Policy, run_episodes
+from highlevel.planner import Planner, planner_hash
+from highlevel.registration import find_controller
+from highlevel.task import Task, load_task
+from lowlevel.controller import Controller, content_hash
+
+SCRIPTED = "scripted"
+EPISODES_FILE = "episodes.json"
+LIFT_STAGE = "lift"
+"""The stage whose passing counts as the partial success ``lift_up``, if a task has it."""
+ROBOTS = 32
+"""Robots side by side."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Measure the success rate of a planner over fixed episodes."""
+
+    planner: str
+    """Planner folder, or "scripted" for the task's scripted expert."""
+    task: str = "lift_box"
+    """Name of the task."""
+    controller: Path | None = None
+    """Controller folder; the shipped one if there is only one."""
+    episodes: int = 500
+    """Episodes; episode i of a seed is the same for every planner."""
+    seed: int = 0
+    """Seed of the episodes."""
+    controls: bool = False
+    """Also run the task's negative controls, which must all fail."""
+    control_episodes: int = 100
+    """Episodes of each negative control."""
+    output: Path = Path("runs/evaluation/highlevel")
+    """Folder for report.md, metrics.json and plots; files of an earlier report there are replaced."""
+    robots: int = ROBOTS
+    """Robots side by side; the last digits of the figures depend on it."""
+    threads: int = os.cpu_count() or 1
+    """Physics threads."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Everything a report shows."""
+
+    arguments: Arguments
+    controller: str
+    """Content hash."""
+    planner: str | None
+    """Content hash; None for the scripted expert."""
+    stages: tuple[str, ...]
+    records: list[EpisodeRecord]
+    controls: dict[str, list[EpisodeRecord]]
+    seconds: float
+    """Time the evaluation took [s]."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of ``evaluate-highlevel``."""
+    parsed = tyro.cli(Arguments, args=arguments)
+    run_command("evaluate-highlevel", lambda: _run(parsed))
+
+
+def _run(arguments: Arguments) -> None:
+    for name in ("episodes", "control_episodes", "robots", "threads"):
+        if getattr(arguments, name) < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
+    task = load_task(arguments.task)
+    check_output(arguments.output)
+    folder = find_controller(arguments.controller)
+    Controller.load(folder)
+    if arguments.planner != SCRIPTED:
+        Planner.load(arguments.planner, folder)
+    torch.set_num_threads(1)
+    print(f"evaluating {arguments.planner} on {task.name}", flush=True)
+    evaluation = evaluate(arguments, folder)
+    write_results(arguments.output, lambda output: write_report(output, evaluation))
+    print(summary(evaluation))
+    print(f"report: {arguments.output / REPORT_FILE}   figures: {arguments.output / METRICS_FILE}")
+
+
+def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
+    """Run the episodes and, if wanted, the negative controls, each from the first episode of the seed on."""
+    began = time.monotonic()
+    task = load_task(arguments.task)
+    runs: dict[str, tuple[Task, int]] = {"": (task, arguments.episodes)}
+    if arguments.controls:
+        for name in control_names(task):
+            runs[name] = (with_control(task, name), arguments.control_episodes)
+    results: dict[str, list[EpisodeRecord]] = {}
+    with progress_bar() as progress:
+        bar = progress.add_task("episodes", total=sum(count for _, count in runs.values()))
+        finished = 0
+        for name, (variant, count) in runs.items():
+            progress.update(bar, description=name.replace("_", " ") or "episodes")
+            physics = PhysicsConfig(num_threads=arguments.threads)
+            environment = CommandEnvironment(variant, controller, arguments.robots, physics=physics)
+            policy = make_policy(arguments.planner, environment, controller)
+            before = finished
+
+            def show(over: int, before: int = before) -> None:
+                progress.update(bar, completed=before + over)
+
+            results[name] = run_episodes(environment, policy, count, arguments.seed, on_progress=show)
+            finished += count
+    identity = None if arguments.planner == SCRIPTED else planner_hash(arguments.planner)
+    return Evaluation(
+        arguments=arguments,
+        controller=content_hash(controller),
+        planner=identity,
+        stages=task.stages,
+        records=results.pop(""),
+        controls=results,
+        seconds=time.monotonic() - began,
+    )
+
+
+def make_policy(planner: str, environment: CommandEnvironment, controller: Path) -> Policy:
+    """The scripted expert of the environment's task, or the planner in a folder.
+
+    Raises:
+        PlannerError: if the planner does not belong to this task and controller.
+    """
+    if planner == SCRIPTED:
+        expert: Policy = environment.task.expert(environment)
+        return expert
+    loaded = Planner.load(planner, controller)
+    loaded.require_environment(environment)
+    return loaded
+
+
+def control_names(task: Task) -> tuple[str, ...]:
+    """Names of a task's negative controls: the values of ``config.control`` beside ``none``.
+
+    Raises:
+        ValueError: if the task has no negative controls.
+    """
+    config: Any = getattr(task, "config", None)
+    hint = get_type_hints(type(config)).get("control") if config is not None else None
+    names = tuple(name for name in get_args(hint) if name != "none")
+    if not names:
+        raise ValueError(f"the task {task.name!r} has no negative controls: leave out --controls")
+    return names
+
+
+def with_control(task: Task, name: str) -> Task:
+    """A fresh copy of ``task`` under a negative control."""
+    config: Any = task.config  # type: ignore[attr-defined]
+    factory: Any = type(task)
+    controlled: Task = factory(replace(config, control=name))
+    return controlled
+
+
+# -- figures -------------------------------------------------------------------------------------------------
+
+
+def success_figures(records: list[EpisodeRecord], stages: tuple[str, ...]) -> dict[str, Figure]:
+    """``full``, ``lift_up``, ``fall_rate``, the share that passed each stage, time to success, and return."""
+    figures = {
+        "full": share_figure([record.success for record in records]),
+        "fall_rate": share_figure([record.failure == "fall" for record in records]),
+        "success_time": mean_figure([record.duration for record in records if record.success], "s"),
+        "return": mean_figure([record.total_reward for record in records], "1"),
+    }
+    for number, stage in enumerate(stages, start=1):
+        figures[f"stage_{stage}"] = share_figure([record.stage >= number for record in records])
+    if LIFT_STAGE in stages:
+        figures["lift_up"] = figures[f"stage_{LIFT_STAGE}"]
+    return figures
+
+
+def failure_figures(records: list[EpisodeRecord]) -> dict[str, Figure]:
+    """Share of episodes that ended in each kind of failure, the most frequent first."""
+    names = Counter(record.failure for record in records if record.failure is not None)
+    return {
+        name: share_figure([record.failure == name for record in records]) for name, _ in names.most_common()
+    }
+
+
+def all_figures(evaluation: Evaluation) -> dict[str, Figure]:
+    """All figures of ``metrics.json``; those of a control end in its name."""
+    figures = success_figures(evaluation.records, evaluation.stages)
+    failures = failure_figures(evaluation.records)
+    figures |= {f"failure_{name}": figure for name, figure in failures.items()}
+    for control, records in evaluation.controls.items():
+        controlled = success_figures(records, evaluation.stages)
+        for name in ("full", "lift_up", "fall_rate"):
+            if name in controlled:
+                figures[f"{name}_{control}"] = controlled[name]
+    return figures
+
+
+# -- report --------------------------------------------------------------------------------------------------
+
+
+def write_report(folder: Path, evaluation: Evaluation) -> None:
+    """Write ``report.md``, plot, ``metrics.json`` and ``episodes.json`` into ``folder``."""
+    arguments, figures = evaluation.arguments, all_figures(evaluation)
+    stages = {stage: figures[f"stage_{stage}"] for stage in evaluation.stages}
+    panels = {"share that passed a stage": stages | {"success": figures["full"]}}
+    failures = failure_figures(evaluation.records)
+    if failures:
+        panels["share that failed by"] = failures
+    plot_bars(folder / "stages.png", panels, columns=2)
+    (folder / REPORT_FILE).write_text(report_text(evaluation, figures))
+    write_json(folder / EPISODES_FILE, [asdict(record) for record in evaluation.records])
+    content = metrics(
+        figures,
+        arguments.seed,
+        evaluation.controller,
+        evaluation.planner or SCRIPTED,
+        task=arguments.task,
+        seconds=round(evaluation.seconds, 1),
+    )
+    write_metrics(folder, content)
+
+
+def summary(evaluation: Evaluation) -> str:
+    """The headline in one line."""
+    figures = all_figures(evaluation)
+    parts = [f"full {format_figure(figures['full'])}"]
+    if "lift_up" in figures:
+        parts.append(f"lift-up {format_figure(figures['lift_up'])}")
+    parts.append(f"falls {format_figure(figures['fall_rate'])}")
+    return "  ".join([*parts, f"over {len(evaluation.records)} episodes"])
+
+
+def report_text(evaluation: Evaluation, figures: dict[str, Figure]) -> str:
+    """``report.md``."""
+    arguments, count = evaluation.arguments, len(evaluation.records)
+    planner = f"Planner `{evaluation.planner}`" if evaluation.planner else "Scripted expert"
+    headline = {
+        "full success": "full",
+        "lift-up": "lift_up",
+        "falls": "fall_rate",
+        "time to success [s]": "success_time",
+    }
+    lines = [
+        f"# {arguments.task.replace('_', ' ').capitalize()}",
+        "",
+        f"{planner} on controller `{evaluation.controller}`, {count} episodes, seed {arguments.seed}. Shares "
+        "with 95 % Wilson intervals. Full success is the whole task, lift-up only its lifting stage.",
+        "",
+        markdown_table(
+            ["figure", "value"],
+            [[label, format_figure(figures[name])] for label, name in headline.items() if name in figures],
+        ),
+        "## Stages",
+        "",
+        markdown_table(
+            ["passed", "share of episodes"],
+            [[stage, format_figure(figures[f"stage_{stage}"])] for stage in evaluation.stages],
+        ),
+        "![stages](stages.png)",
+        "",
+        "## Failures",
+        "",
+        *_failure_section(evaluation),
+    ]
+    if evaluation.controls:
+        lines += [
+            "## Negative controls",
+            "",
+            "These must never succeed.",
+            "",
+            _control_table(evaluation, figures),
+        ]
+    return "\n".join(lines)
+
+
+def _failure_section(evaluation: Evaluation) -> list[str]:
+    failures = failure_figures(evaluation.records)
+    if not failures:
+        return ["None.", ""]
+    rows = []
+    for name, figure in failures.items():
+        numbers = [str(record.number) for record in evaluation.records if record.failure == name]
+        shown = ", ".join(numbers[:8]) + (", …" if len(numbers) > 8 else "")
+        rows.append([name.replace("_", " "), str(len(numbers)), format_figure(figure), shown])
+    return [markdown_table(["failure", "count", "share of episodes", "episode numbers"], rows)]
+
+
+def _control_table(evaluation: Evaluation, figures: dict[str, Figure]) -> str:
+    rows = []
+    for control, records in evaluation.controls.items():
+        succeeded = sum(record.success for record in records)
+        verdict = (
+            "as it must be"
+            if succeeded == 0
+            else f"**{succeeded} succeeded: the success criterion is wrong**"
+        )
+        full = figures[f"full_{control}"]
+        rows.append([control.replace("_", " "), str(len(records)), format_figure(full), verdict])
+    return markdown_table(["control", "episodes", "full success", "verdict"], rows)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

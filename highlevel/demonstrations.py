@@ -1,0 +1,166 @@
+"""Demonstrations: successful episodes of a scripted expert, as arrays in one ``.npz`` file."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from highlevel.draws import uniform
+from highlevel.environment import CommandEnvironment
+from highlevel.episodes import Policy
+from highlevel.task import rows
+from lowlevel.files import atomic_write
+
+_NOISE_STREAM = 3
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Decisions of successful episodes, one after the other."""
+
+    observation: np.ndarray
+    """(T, D) float32"""
+    action: np.ndarray
+    """What the expert wanted, not what noise made of it (T, 21) float32."""
+    value: np.ndarray
+    """Discounted sum of the rewards that followed (T,) float32."""
+    episode: np.ndarray
+    """Number of the episode each decision belongs to (T,) integers."""
+    attempts: int
+    """Episodes that were run to get these."""
+
+    @property
+    def count(self) -> int:
+        """Number of episodes."""
+        return len(np.unique(self.episode))
+
+    def joined(self, other: Demonstrations) -> Demonstrations:
+        """These, then ``other``, whose episodes are renumbered to stay apart."""
+        offset = int(self.episode.max(initial=-1)) + 1
+        return Demonstrations(
+            np.concatenate([self.observation, other.observation]),
+            np.concatenate([self.action, other.action]),
+            np.concatenate([self.value, other.value]),
+            np.concatenate([self.episode, other.episode + offset]),
+            self.attempts + other.attempts,
+        )
+
+    def save(self, path: Path) -> None:
+        """Write the file; a crash while writing leaves no half of it."""
+        arrays = {name: getattr(self, name) for name in ("observation", "action", "value", "episode")}
+        atomic_write(path, lambda file: np.savez_compressed(file, attempts=np.array(self.attempts), **arrays))
+
+    @classmethod
+    def load(cls, path: Path) -> Demonstrations:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is damaged or holds numbers that are not finite.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist: record demonstrations first")
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                loaded = cls(
+                    file["observation"], file["action"], file["value"], file["episode"], int(file["attempts"])
+                )
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} does not hold demonstrations: {error}") from error
+        for name in ("observation", "action", "value"):
+            if not np.isfinite(getattr(loaded, name)).all():
+                raise ValueError(f"{path} holds numbers in {name!r} that are not finite: record it again")
+        return loaded
+
+
+@torch.no_grad()
+def record(
+    environment: CommandEnvironment,
+    expert: Policy,
+    count: int,
+    seed: int,
+    noise: float,
+    discount: float,
+    on_progress: Callable[[int, int], None] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Demonstrations:
+    """Run the expert until ``count`` episodes have succeeded.
+
+    Args:
+        environment: where.
+        expert: who.
+        count: successes wanted.
+        seed: seed of the episodes.
+        noise: standard deviation of the noise on the executed actions, which shows how the expert recovers
+        (DART).
+        discount: of the returns, per decision.
+        on_progress: told successes and attempts after every episode.
+        should_stop: asked after every decision; what has been recorded by then is returned.
+
+    Raises:
+        RuntimeError: if the expert does not succeed once in 4 ``count`` + 100 attempts.
+    """
+    observation = environment.reset(seed)
+    expert.reset(rows(environment.num_envs))
+    running: list[list[tuple[Tensor, Tensor, float]]] = [[] for _ in range(environment.num_envs)]
+    finished: list[tuple[int, list[tuple[Tensor, Tensor, float]]]] = []
+    attempts = 0
+    while len(finished) < count and not should_stop():
+        action = expert.act(observation)
+        moment = environment.episode * 10_000 + environment.decisions
+        # Uniform numbers of the wanted standard deviation.
+        shake = noise * 3.0**0.5 * (2.0 * uniform(seed, moment, _NOISE_STREAM, action.shape[1]) - 1.0)
+        result = environment.step((action + shake).clamp(-1.0, 1.0))
+        rewards, done = result.reward.tolist(), result.done.tolist()
+        for robot, steps in enumerate(running):
+            steps.append((observation[robot], action[robot], rewards[robot]))
+            if done[robot]:
+                attempts += 1
+                if result.success[robot]:
+                    finished.append((int(result.episode[robot]), steps))
+                running[robot] = []
+        if any(done):
+            expert.reset(torch.nonzero(result.done)[:, 0])
+            if on_progress is not None:
+                on_progress(len(finished), attempts)
+            if not finished and attempts > 4 * count + 100:
+                raise RuntimeError(
+                    f"the expert failed {attempts} times in a row: check the controller with "
+                    f"'evaluate-lowlevel'"
+                )
+        observation = result.observation
+    return _pack(finished, attempts, discount, environment)
+
+
+def _pack(
+    finished: list[tuple[int, list[tuple[Tensor, Tensor, float]]]],
+    attempts: int,
+    discount: float,
+    environment: CommandEnvironment,
+) -> Demonstrations:
+    steps = [step for _, episode in finished for step in episode]
+    values: list[float] = []
+    for _, episode in finished:
+        following, returns = 0.0, []
+        for _, _, reward in reversed(episode):
+            following = reward + discount * following
+            returns.append(following)
+        values += reversed(returns)
+    width = environment.observation_size
+    return Demonstrations(
+        observation=np.array([step[0].numpy() for step in steps], np.float32).reshape(-1, width),
+        action=np.array([step[1].numpy() for step in steps], np.float32).reshape(
+            -1, environment.command.shape[1]
+        ),
+        value=np.array(values, np.float32),
+        episode=np.repeat(
+            [number for number, _ in finished], [len(episode) for _, episode in finished]
+        ).astype(int),
+        attempts=attempts,
+    )

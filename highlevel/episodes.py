@@ -1,0 +1,91 @@
+"""Running numbered episodes to their end: for evaluation, model selection and demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from highlevel.environment import CommandEnvironment, StepResult
+from highlevel.task import rows
+
+
+class Policy(Protocol):
+    """Whatever decides for all robots of an environment: a planner, or a scripted expert."""
+
+    def act(self, observation: Tensor) -> Tensor:
+        """Actions (N, 21) in [-1, 1] for ``observation`` (N, D)."""
+
+    def reset(self, ids: Tensor) -> None:
+        """Robots ``ids`` (n,) begin new episodes."""
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """How one episode went."""
+
+    number: int
+    success: bool
+    stage: int
+    """Stages passed."""
+    failure: str | None
+    """Why it failed; None for a success."""
+    duration: float
+    """[s]"""
+    total_reward: float
+
+
+Observer = Callable[[Tensor, Tensor, StepResult], None]
+"""Called after every decision with the observation and action it was made from and with, and the result."""
+
+
+@torch.no_grad()
+def run_episodes(
+    environment: CommandEnvironment,
+    policy: Policy,
+    count: int,
+    seed: int,
+    observers: Sequence[Observer] = (),
+    on_progress: Callable[[int], None] | None = None,
+) -> list[EpisodeRecord]:
+    """Run episodes 0 to ``count`` - 1 of ``seed`` and return their records in order.
+
+    The same episodes are run for every number of robots. ``on_progress`` is told how many are over.
+    """
+    observation = environment.reset(seed)
+    policy.reset(rows(environment.num_envs))
+    records: dict[int, EpisodeRecord] = {}
+    total = torch.zeros(environment.num_envs)
+    while len(records) < count:
+        action = policy.act(observation)
+        result = environment.step(action)
+        total += result.reward
+        for observer in observers:
+            observer(observation, action, result)
+        over = torch.nonzero(result.done)[:, 0]
+        for robot in over.tolist():
+            number = int(result.episode[robot])
+            if number < count:
+                records[number] = EpisodeRecord(
+                    number=number,
+                    success=bool(result.success[robot]),
+                    stage=int(result.final_stage[robot]),
+                    failure=result.failures.get(robot),
+                    duration=float(result.duration[robot]),
+                    total_reward=float(total[robot]),
+                )
+        if len(over):
+            total[over] = 0.0
+            policy.reset(over)
+            if on_progress is not None:
+                on_progress(len(records))
+        observation = result.observation
+    return [records[number] for number in sorted(records)]
+
+
+def success_rate(records: Sequence[EpisodeRecord]) -> float:
+    """Share of successes."""
+    return sum(record.success for record in records) / max(len(records), 1)

@@ -1,0 +1,185 @@
+"""The trained planner as a folder: observation in, action out, for any number of robots.
+
+``planner.json``         task, controller, observation layout, action ranges, network, and where it comes from
+``weights.safetensors``  normaliser and actor
+
+Nothing in it is pickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from highlevel.action import ActionConfig
+from highlevel.environment import CommandEnvironment
+from highlevel.policy import PlannerActor
+from highlevel.task import ObservationBlock
+from lowlevel.commands import COMMAND_SIZE
+from lowlevel.controller import content_hash
+from lowlevel.files import atomic_write
+from lowlevel.plain import from_plain
+
+FORMAT_VERSION = 1
+PLANNER_FILE, WEIGHTS_FILE = "planner.json", "weights.safetensors"
+
+
+class PlannerError(ValueError):
+    """A planner folder cannot be used; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Contents of ``planner.json`` that define behaviour."""
+
+    task: str
+    """Name of the task."""
+    task_config: dict[str, Any]
+    """How the task was set up in training."""
+    controller: str
+    """Identity of the controller that the planner was trained on."""
+    observation: tuple[ObservationBlock, ...]
+    """Blocks of the observation, in order."""
+    action: ActionConfig
+    """What the action means."""
+    hidden: tuple[int, ...]
+    """Widths of the network's hidden layers."""
+
+
+class Planner:
+    """A frozen planner. It has no memory: :meth:`act` depends on the observation alone."""
+
+    def __init__(self, config: PlannerConfig, actor: PlannerActor, provenance: dict[str, Any]) -> None:
+        self.config = config
+        self.provenance = provenance
+        self.actor = actor.eval().requires_grad_(False)
+
+    @torch.no_grad()
+    def act(self, observation: Tensor) -> Tensor:
+        """Action (N, 21) in [-1, 1] for ``observation`` (N, D); deterministic."""
+        return self.actor(observation).clamp(-1.0, 1.0)
+
+    def reset(self, ids: Tensor) -> None:
+        """Robots ``ids`` begin new episodes: nothing to forget."""
+
+    @classmethod
+    def load(cls, folder: Path | str, controller: Path | str | None = None) -> Planner:
+        """Load a planner folder, and check that it belongs to the folder of a ``controller`` if one is given.
+
+        Raises:
+            PlannerError: if a file is missing, damaged, of another version, holds weights that are not
+            finite, or
+                belongs to another controller.
+        """
+        folder = Path(folder)
+        description = _read_json(folder)
+        path = folder / PLANNER_FILE
+        version = description.get("format_version")
+        if version != FORMAT_VERSION:
+            raise PlannerError(f"{path} has format version {version}, this code reads {FORMAT_VERSION}")
+        try:
+            config = from_plain(PlannerConfig, description["config"])
+            provenance = description["provenance"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise PlannerError(f"{path} is incomplete: {error}") from error
+        tensors = _read_weights(folder)
+        size = sum(block.size for block in config.observation)
+        actor = PlannerActor(size, COMMAND_SIZE, config.hidden)
+        try:
+            actor.load_state_dict(tensors)
+        except RuntimeError as error:
+            reason = str(error).splitlines()[-1].strip()
+            raise PlannerError(f"{folder / WEIGHTS_FILE} does not fit {PLANNER_FILE}: {reason}") from error
+        planner = cls(config, actor, provenance)
+        if controller is not None:
+            planner.require_controller(controller)
+        return planner
+
+    def require_controller(self, folder: Path | str) -> None:
+        """Check that the planner was trained on the controller in ``folder``.
+
+        Raises:
+            PlannerError: if it was trained on another one.
+        """
+        found = content_hash(folder)
+        if found != self.config.controller:
+            raise PlannerError(
+                f"this planner was trained on controller {self.config.controller}, but {folder} is {found}: "
+                "use the controller it was trained on, or train a planner for this one"
+            )
+
+    def require_environment(self, environment: CommandEnvironment) -> None:
+        """Check that the planner's observation and action are those of ``environment``.
+
+        Raises:
+            PlannerError: if they are not.
+        """
+        task = environment.task
+        if self.config.task != task.name:
+            raise PlannerError(f"this planner is for task {self.config.task!r}, not {task.name!r}")
+        if self.config.observation != environment.blocks or self.config.action != task.action:
+            raise PlannerError("this planner was trained with another observation or action: train it again")
+
+    def save(self, folder: Path | str) -> None:
+        """Write the folder; each file is complete or absent."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        tensors = {name: tensor.contiguous() for name, tensor in self.actor.state_dict().items()}
+        for name, tensor in tensors.items():
+            if not torch.isfinite(tensor).all():
+                raise PlannerError(f"the planner's {name!r} is not finite: it is not saved")
+        atomic_write(folder / WEIGHTS_FILE, lambda file: file.write(save(tensors)))
+        description = {
+            "format_version": FORMAT_VERSION,
+            "config": asdict(self.config),
+            "provenance": self.provenance,
+        }
+        text = json.dumps(description, indent=1)
+        atomic_write(folder / PLANNER_FILE, lambda file: file.write(text.encode()))
+
+
+def planner_hash(folder: Path | str) -> str:
+    """Identity of a planner: SHA-256 over configuration and weights, 16 hexadecimal digits."""
+    digest = hashlib.sha256()
+    digest.update(json.dumps(_read_json(Path(folder))["config"], sort_keys=True).encode())
+    digest.update((Path(folder) / WEIGHTS_FILE).read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _read_json(folder: Path) -> dict[str, Any]:
+    path = folder / PLANNER_FILE
+    if not path.is_file():
+        raise PlannerError(
+            f"{path} is missing: give a planner folder, such as one under checkpoints/highlevel"
+        )
+    try:
+        content = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise PlannerError(f"{path} is damaged: {error}") from error
+    if not isinstance(content, dict):
+        raise PlannerError(f"{path} is damaged: it does not hold a JSON object")
+    return content
+
+
+def _read_weights(folder: Path) -> dict[str, Tensor]:
+    path = folder / WEIGHTS_FILE
+    if not path.is_file():
+        raise PlannerError(f"{path} is missing: copy the whole planner folder")
+    try:
+        tensors = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise PlannerError(f"{path} is damaged or truncated: {error}") from error
+    for name, tensor in tensors.items():
+        if not torch.isfinite(tensor).all():
+            raise PlannerError(
+                f"{path} holds numbers in {name!r} that are not finite: train the planner again"
+            )
+    return tensors

@@ -1,0 +1,96 @@
+"""The planner's network in Stable-Baselines3's terms, and where its actor is found in there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gymnasium
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import Tensor, nn
+
+CLIP = 8.0
+"""Normalised observations are clipped to +- this."""
+
+
+@dataclass(frozen=True)
+class PlannerNetwork:
+    """Shape of actor and critic, which share nothing but the normaliser."""
+
+    hidden: tuple[int, ...] = (256, 256, 128)
+    """Widths of the hidden layers, with ELU between them."""
+    log_std: float = -1.5
+    """Logarithm of the initial standard deviation of the action."""
+
+
+class Normaliser(BaseFeaturesExtractor):
+    """Fixed normalisation of the observation. It is part of the weights, so it cannot be lost."""
+
+    def __init__(self, observation_space: gymnasium.Space, scale: Tensor | None = None) -> None:
+        assert observation_space.shape is not None
+        super().__init__(observation_space, features_dim=observation_space.shape[0])
+        size = observation_space.shape[0]
+        self.mean: Tensor
+        self.scale: Tensor
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size) if scale is None else scale.clone())
+
+    def forward(self, observations: Tensor) -> Tensor:
+        return ((observations - self.mean) / self.scale).clamp(-CLIP, CLIP)
+
+    def fit(self, observations: Tensor, floor: Tensor) -> None:
+        """Take mean and standard deviation from ``observations`` (T, D), but no scale below ``floor``
+        (D,)."""
+        self.mean.copy_(observations.mean(dim=0))
+        self.scale.copy_(torch.maximum(observations.std(dim=0), floor))
+
+
+class PlannerActor(nn.Module):
+    """The deterministic planner alone: observation (N, D) -> action (N, 21), not clipped."""
+
+    def __init__(self, observation_size: int, action_size: int, hidden: tuple[int, ...]) -> None:
+        super().__init__()
+        self.mean: Tensor
+        self.scale: Tensor
+        self.register_buffer("mean", torch.zeros(observation_size))
+        self.register_buffer("scale", torch.ones(observation_size))
+        layers: list[nn.Module] = []
+        for width_in, width_out in zip((observation_size, *hidden[:-1]), hidden, strict=True):
+            layers += [nn.Linear(width_in, width_out), nn.ELU()]
+        self.hidden = nn.Sequential(*layers)
+        self.output = nn.Linear(hidden[-1], action_size)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        normalised = ((observation - self.mean) / self.scale).clamp(-CLIP, CLIP)
+        return self.output(self.hidden(normalised))
+
+    @classmethod
+    def from_policy(cls, policy: ActorCriticPolicy, hidden: tuple[int, ...]) -> PlannerActor:
+        """A copy of the actor of a policy that was built with :func:`policy_arguments`."""
+        normaliser = policy.features_extractor
+        assert isinstance(normaliser, Normaliser)
+        actor = cls(normaliser.features_dim, int(policy.action_net.weight.shape[0]), hidden)
+        actor.hidden.load_state_dict(policy.mlp_extractor.policy_net.state_dict())
+        actor.output.load_state_dict(policy.action_net.state_dict())
+        actor.mean.copy_(normaliser.mean)
+        actor.scale.copy_(normaliser.scale)
+        return actor.eval().requires_grad_(False)
+
+
+def policy_arguments(network: PlannerNetwork, scale: Tensor) -> dict[str, object]:
+    """``policy_kwargs`` of Stable-Baselines3's ``MlpPolicy``; ``scale`` (D,) is the task's own observation
+    scale."""
+    return {
+        "net_arch": {"pi": list(network.hidden), "vf": list(network.hidden)},
+        "activation_fn": nn.ELU,
+        "ortho_init": False,
+        "log_std_init": network.log_std,
+        "features_extractor_class": Normaliser,
+        "features_extractor_kwargs": {"scale": scale},
+    }
+
+
+def actor_parameters(policy: ActorCriticPolicy) -> list[nn.Parameter]:
+    """Parameters that only the actor uses."""
+    return [*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters(), policy.log_std]

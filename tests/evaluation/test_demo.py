@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from evaluation.demo import Arguments, Story, main, outcome_text, run_episode
+
+
+def test_the_story_is_that_of_the_numbered_episode(untrained_controller: Path, tmp_path: Path) -> None:
+    stories = []
+    for number in (0, 1, 1):
+        arguments = Arguments("scripted", seed=2, episode=number, threads=1)
+        story, twin = run_episode(arguments, untrained_controller, tmp_path / f"{len(stories)}.rrd")
+        stories.append(story)
+    assert not stories[0].success and stories[0].failure is not None
+    assert not np.array_equal(stories[0].instants["start"], stories[1].instants["start"])
+    np.testing.assert_array_equal(stories[1].instants["end"], stories[2].instants["end"])
+    box = twin.model.geom("box").size
+    assert ((box >= 0.125) & (box <= 0.175)).all() and len(set(box.tolist())) == 3, "the box has a drawn size"
+
+
+def test_command_leaves_recording_report_and_outcome(
+    untrained_controller: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "demo"
+    where = ["--controller", str(untrained_controller), "--output", str(output)]
+    main(["--planner", "scripted", *where, "--no-pictures", "--threads", "1"])
+    assert {file.name for file in output.iterdir()} == {"episode.rrd", "report.md", "outcome.json"}
+    outcome = json.loads((output / "outcome.json").read_text())
+    assert outcome["success"] is False and outcome["planner"] == "scripted"
+    times: dict[str, int] = {}
+    for chunk in RrdReader(output / "episode.rrd").stream().to_chunks():
+        if not chunk.is_static:
+            times[chunk.entity_path] = times.get(chunk.entity_path, 0) + chunk.num_rows
+    assert times["/world/pelvis"] == times["/world/box"] >= 5
+    printed = capsys.readouterr().out
+    assert "failure" in printed and str(output / "episode.rrd") in printed
+    assert list(tmp_path.iterdir()) == [output]
+
+
+def test_outcomes_in_words() -> None:
+    assert outcome_text(Story(True, None, 9.5, {"lift": 7.0}, {})) == "success after 9.5 s"
+    failed = Story(False, "drop", 8.0, {"approach": 3.0, "lift": 7.0}, {})
+    assert outcome_text(failed) == "failure (drop) after 8.0 s, after the stage 'lift'"
+    assert "before the first stage" in outcome_text(Story(False, "fall", 1.0, {}, {}))
+
+
+def test_bad_input_is_refused_in_one_sentence(untrained_controller: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--planner", str(tmp_path), "--controller", str(untrained_controller)])
+    assert "planner.json is missing" in str(stop.value) and "\n" not in str(stop.value)

@@ -1,0 +1,30 @@
+"""Small environments on the untrained controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from highlevel.environment import CommandEnvironment, PhysicsConfig
+from highlevel.task import load_task
+
+
+@pytest.fixture
+def coarse_physics() -> PhysicsConfig:
+    """Cheap physics for tests of everything but physics."""
+    return PhysicsConfig(timestep=0.005, solver_iterations=4, num_threads=1)
+
+
+@pytest.fixture
+def make_environment(
+    untrained_controller: Path, coarse_physics: PhysicsConfig
+) -> Callable[..., CommandEnvironment]:
+    torch.set_num_threads(1)
+
+    def make(num_envs: int = 2, seed: int = 0) -> CommandEnvironment:
+        return CommandEnvironment(load_task("lift_box"), untrained_controller, num_envs, seed, coarse_physics)
+
+    return make

@@ -1,0 +1,144 @@
+"""The option loop: determinism, resets in the middle, frozen controller, ends inside an option."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from highlevel.environment import CommandEnvironment, StepResult
+from highlevel.task import Decision, Outcome
+from lowlevel.commands import HEIGHT
+from lowlevel.measures import Measurement
+
+Make = Callable[..., CommandEnvironment]
+
+
+def _actions(decisions: int, robots: int, seed: int = 0) -> Tensor:
+    return 2.0 * torch.rand(decisions, robots, 21, generator=torch.Generator().manual_seed(seed)) - 1.0
+
+
+def _run(environment: CommandEnvironment, actions: Tensor) -> list[StepResult]:
+    return [environment.step(action) for action in actions]
+
+
+def test_the_same_seed_gives_the_same_episodes_in_the_same_and_in_another_instance(
+    make_environment: Make,
+) -> None:
+    actions = _actions(12, 3)
+    first, second = make_environment(3), make_environment(3)
+    runs = []
+    for environment in (first, first, second):
+        start = environment.reset(seed=5)
+        results = _run(environment, actions)
+        runs.append(
+            (start, torch.stack([r.observation for r in results]), torch.stack([r.reward for r in results]))
+        )
+    for other in runs[1:]:
+        for a, b in zip(runs[0], other, strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert not torch.equal(first.reset(seed=6), runs[0][0])
+
+
+def test_an_episode_begun_in_the_middle_of_a_batch_equals_a_fresh_one(make_environment: Make) -> None:
+    environment = make_environment(2)
+    environment.reset(seed=1)
+    falling = torch.zeros(2, 21)
+    falling[0, 3], falling[0, 5] = -1.0, 1.0
+    for step in range(150):
+        result = environment.step(_actions(1, 2, step)[0])
+        if bool(result.done[0]) and not bool(result.done[1]):
+            break
+    else:
+        pytest.fail("the untrained controller was expected to fall")
+    began, numbers = result.observation[0], environment.episode.clone()
+    actions = 0.1 * _actions(5, 2, 99)
+    later = [environment.step(action) for action in actions]
+
+    fresh = make_environment(2)
+    fresh.reset(seed=1)
+    fresh.episode = numbers
+    assert not any(bool(result.done[0]) for result in later)
+    fresh._begin(torch.arange(2))
+    torch.testing.assert_close(fresh.observe()[0], began, rtol=0, atol=0)
+    again = [fresh.step(action) for action in actions]
+    for a, b in zip(later, again, strict=True):
+        torch.testing.assert_close(a.final_observation[0], b.final_observation[0], rtol=1e-4, atol=1e-4)
+
+
+def test_a_planner_step_leaves_the_controller_as_it_was(make_environment: Make) -> None:
+    environment = make_environment()
+    environment.reset(seed=0)
+    before = {name: value.clone() for name, value in environment.controller.actor.state_dict().items()}
+    _run(environment, _actions(5, 2))
+    for name, value in environment.controller.actor.state_dict().items():
+        torch.testing.assert_close(value, before[name], rtol=0, atol=0)
+    assert not any(parameter.requires_grad for parameter in environment.controller.actor.parameters())
+
+
+def test_the_observed_previous_command_is_the_limited_and_feasible_one(make_environment: Make) -> None:
+    environment = make_environment()
+    environment.reset(seed=0)
+    deep = torch.zeros(2, 21)
+    deep[:, 3], deep[:, 5] = -1.0, 1.0
+    result = environment.step(deep)
+    names = [block.name for block in environment.blocks]
+    start = sum(block.size for block in environment.blocks[: names.index("previous_command")])
+    seen = result.final_observation[:, start : start + 21]
+    torch.testing.assert_close(seen, environment.action_map.normalise(environment.command))
+    assert torch.allclose(environment.command[:, HEIGHT], torch.tensor(0.72), atol=1e-4)
+    clamped = environment.controller.clamp_command(environment.command)
+    torch.testing.assert_close(clamped, environment.command)
+
+
+def test_rewards_add_up_over_the_option_and_stop_where_the_episode_ends(
+    make_environment: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment = make_environment()
+    environment.reset(seed=0)
+    calls = []
+
+    def judge(measured: Measurement, decision: Decision) -> Outcome:
+        calls.append(1)
+        success = torch.tensor([len(calls) == 3, False])
+        return Outcome(torch.ones(2), success, torch.zeros(2, dtype=torch.bool))
+
+    monkeypatch.setattr(environment.task, "step", judge)
+    result = environment.step(torch.zeros(2, 21))
+    assert len(calls) == environment.task.action.decision_steps == 5
+    assert result.reward.tolist() == [3.0, 5.0]
+    assert result.success.tolist() == [True, False]
+    assert result.terminated.tolist() == [True, False] and not result.truncated.any()
+    assert environment.episode.tolist() == [2, 1]
+    assert not torch.equal(result.observation[0], result.final_observation[0])
+    torch.testing.assert_close(result.observation[1], result.final_observation[1])
+
+
+def test_an_episode_that_runs_out_of_time_is_truncated(make_environment: Make) -> None:
+    environment = make_environment()
+    environment.reset(seed=0)
+    environment.decisions[:] = environment.max_decisions - 1
+    result = environment.step(environment.action_map.action(environment.command))
+    assert result.truncated.all() and not result.terminated.any()
+    assert set(result.failures.values()) == {"approach_timeout"}
+    assert (environment.decisions == 0).all()
+
+
+def test_bad_actions_are_refused(make_environment: Make) -> None:
+    environment = make_environment()
+    with pytest.raises(RuntimeError, match="call reset"):
+        environment.step(torch.zeros(2, 21))
+    environment.reset(seed=0)
+    for bad in (torch.zeros(3, 21), torch.full((2, 21), float("nan"))):
+        with pytest.raises(ValueError, match="finite and of shape"):
+            environment.step(bad)
+
+
+def test_a_timestep_that_does_not_divide_the_control_period_is_refused(make_environment: Make) -> None:
+    environment = make_environment()
+    environment.physics = replace(environment.physics, timestep=0.003)
+    with pytest.raises(ValueError, match="does not divide"):
+        environment._build_simulation(1)

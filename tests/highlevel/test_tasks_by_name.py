@@ -1,0 +1,51 @@
+"""Tasks are found by name, and unknown ones are refused in one sentence."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+import highlevel
+from highlevel.task import Task, environment_id, load_task, task_names
+
+
+def test_every_task_folder_loads_and_is_registered() -> None:
+    assert "lift_box" in task_names()
+    for name in task_names():
+        task = load_task(name)
+        assert isinstance(task, Task) and task.name == name
+        assert environment_id(name) in gymnasium.registry
+
+
+def test_an_unknown_task_is_refused_with_the_list_of_tasks() -> None:
+    with pytest.raises(ValueError, match=r"there is no task 'fly'; the tasks are: .*lift_box"):
+        load_task("fly")
+
+
+def test_highlevel_knows_no_task_by_name() -> None:
+    source = Path(highlevel.__file__).parent
+    names = {word for name in task_names() for word in (name, name.replace("_", ""))}
+    for path in source.glob("*.py"):
+        code = [line for line in path.read_text().splitlines() if '"""' not in line]
+        for number, line in enumerate(code):
+            is_default = path.name == "trainer.py" and 'task: str = "' in line
+            is_prose = path.name in ("__init__.py", "task.py") and "``" in line
+            if not (is_default or is_prose):
+                assert not any(word in line.lower().replace("/", "") for word in names), (
+                    f"{path.name}: {number}"
+                )
+
+
+def test_a_folder_without_a_task_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import tasks
+
+    folder = tmp_path / "empty_task"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("")
+    monkeypatch.setattr(tasks, "__path__", [*tasks.__path__, str(tmp_path)])
+    with pytest.raises(ValueError, match="no attribute TASK"):
+        load_task("empty_task")
+    sys.modules.pop("tasks.empty_task", None)

@@ -1,0 +1,102 @@
+"""The two public faces of the environment keep their contracts."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import stable_baselines3.common.env_checker
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+import highlevel  # noqa: F401 (registers the tasks)
+from highlevel.environment import CommandEnvironment, PhysicsConfig
+from highlevel.gym_env import PlannerEnv
+from highlevel.vec_env import PlannerVecEnv
+
+Make = Callable[..., CommandEnvironment]
+
+
+def test_the_gymnasium_environment_passes_both_checkers(
+    untrained_controller: Path, coarse_physics: PhysicsConfig
+) -> None:
+    environment = gymnasium.make(
+        "pilot/LiftBox-v0", controller=untrained_controller, physics=coarse_physics
+    ).unwrapped
+    assert isinstance(environment, PlannerEnv)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # An environment of physical quantities has no bounds, and this one is checked without its spec.
+        warnings.filterwarnings("ignore", message=".*(infinity|alternative render modes|spec).*")
+        check_env(environment)
+        stable_baselines3.common.env_checker.check_env(environment)
+
+
+def test_stepping_a_finished_gymnasium_episode_is_refused(
+    untrained_controller: Path, coarse_physics: PhysicsConfig
+) -> None:
+    environment = PlannerEnv("lift_box", untrained_controller, coarse_physics)
+    with pytest.raises(RuntimeError, match="call reset"):
+        environment.step(np.zeros(21, np.float32))
+
+
+def test_the_vec_env_keeps_stable_baselines_contract(make_environment: Make) -> None:
+    environment = make_environment(3)
+    vec_env = PlannerVecEnv(environment)
+    vec_env.seed(4)
+    observation = vec_env.reset()
+    assert observation.shape == (3, environment.observation_size) and observation.dtype == np.float32
+    environment.decisions[1] = environment.max_decisions - 1
+    action = environment.action_map.action(environment.command).numpy()
+    following, reward, done, infos = vec_env.step(action)
+    assert following.dtype == np.float32 and reward.dtype == np.float32 and done.dtype == bool
+    assert done.tolist() == [False, True, False]
+    assert infos[0] == {} and infos[2] == {}
+    info = infos[1]
+    assert info["TimeLimit.truncated"] is True and info["is_success"] is False
+    assert info["failure"] == "approach_timeout" and info["stage"] == 0
+    assert info["episode"]["l"] == 1 and info["episode"]["r"] == pytest.approx(float(reward[1]))
+    # The terminal observation belongs to the old episode, the returned one to the new.
+    assert not np.array_equal(info["terminal_observation"], following[1])
+    time_left = observation.shape[1] - 2
+    assert following[1, time_left] == pytest.approx(1.0)
+    assert info["terminal_observation"][time_left] == pytest.approx(0.0)
+
+    _, _, _, infos = vec_env.step(action)
+    assert infos == [{}, {}, {}]
+
+
+def test_a_fall_is_terminated_and_not_truncated(make_environment: Make) -> None:
+    vec_env = PlannerVecEnv(make_environment(2))
+    vec_env.seed(0)
+    vec_env.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        _, _, done, infos = vec_env.step(rng.uniform(-1, 1, (2, 21)).astype(np.float32))
+        if done.any():
+            break
+    ended = [info for info in infos if info]
+    assert ended and all(info["failure"] == "fall" and not info["TimeLimit.truncated"] for info in ended)
+
+
+def test_seeds_repeat_episodes_and_wrappers_work(make_environment: Make) -> None:
+    vec_env = PlannerVecEnv(make_environment(2))
+    vec_env.seed(3)
+    first = vec_env.reset()
+    following = vec_env.reset()
+    assert not np.array_equal(first, following)
+    vec_env.seed(3)
+    np.testing.assert_array_equal(vec_env.reset(), first)
+    wrapped = VecNormalize(VecMonitor(vec_env))
+    wrapped.reset()
+    observation, _, _, _ = wrapped.step(np.zeros((2, 21), np.float32))
+    assert np.isfinite(observation).all()
+    assert vec_env.get_attr("num_envs") == [2, 2]
+    assert vec_env.env_is_wrapped(VecMonitor) == [False, False]
+    assert vec_env.env_method("observe", indices=0)[0].shape[0] == 2
+    with pytest.raises(ValueError, match="without indices"):
+        vec_env.set_attr("seed", 1, indices=0)

@@ -1,0 +1,169 @@
+"""The frozen controller: golden vectors, ONNX parity, resets, and refusal of bad folders."""
+
+import json
+import shutil
+from pathlib import Path
+
+import onnxruntime
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from lowlevel.controller import (
+    CONFIG_FILE,
+    GOLDEN_FILE,
+    ONNX_FILE,
+    WEIGHTS_FILE,
+    Controller,
+    ControllerError,
+    add_metrics,
+    content_hash,
+)
+from lowlevel.environment import EnvironmentConfig
+from lowlevel.export import export_controller
+from lowlevel.golden import replay
+from lowlevel.observation import map_observation
+from lowlevel.trainer import Trainer, TrainingConfig
+
+SHIPPED = sorted((Path(__file__).parents[2] / "checkpoints" / "lowlevel").glob("*/"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An exported controller with random weights that matter."""
+    path = tmp_path_factory.mktemp("controller")
+    trainer = Trainer(TrainingConfig(environment=EnvironmentConfig(num_robots=6, num_threads=1)), path)
+    weight = trainer.ppo.actor.head.output_weight
+    weight.data += 0.05 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(0))
+    export_controller(trainer, path / "exported")
+    return path / "exported"
+
+
+def golden_steps(folder: Path) -> list[dict[str, torch.Tensor]]:
+    golden = json.loads((folder / GOLDEN_FILE).read_text())
+    return [{name: torch.tensor(value) for name, value in step.items()} for step in golden["steps"]]
+
+
+def check_golden(folder: Path) -> None:
+    controller = Controller.load(folder)
+    controller.reset(4)
+    session = onnxruntime.InferenceSession(folder / ONNX_FILE)
+    for step in golden_steps(folder):
+        assert torch.allclose(replay(controller, step), step["targets"], atol=1e-5)
+        inputs = {
+            "history": step["history"].numpy(),
+            "elevation_map": map_observation(step["elevation_map"]).numpy(),
+            "flag": step["flag"].numpy(),
+        }
+        action = torch.from_numpy(session.run(["action"], inputs)[0])
+        limit = controller.config.action_limit
+        assert torch.allclose(action.clamp(-limit, limit), step["action"], atol=1e-4)
+
+
+def test_golden_vectors_replay_through_torch_and_onnx(folder: Path) -> None:
+    check_golden(folder)
+
+
+@pytest.mark.parametrize("shipped", SHIPPED, ids=lambda path: path.name)
+def test_shipped_controllers_replay_their_golden_vectors(shipped: Path) -> None:
+    check_golden(shipped)
+
+
+def test_resetting_one_robot_forgets_only_that_robot(folder: Path) -> None:
+    steps = golden_steps(folder)
+    controller, fresh = Controller.load(folder), Controller.load(folder)
+    controller.reset(4)
+    fresh.reset(4)
+    for step in steps:
+        replay(controller, step)
+    unbroken = controller.twin(4)
+    for step in steps:
+        replay(unbroken, step)
+    controller.reset(4, torch.tensor([2]))
+    after, first, continued = (replay(c, steps[0]) for c in (controller, fresh, unbroken))
+    assert torch.equal(after[2], first[2])
+    assert torch.equal(after[[0, 1, 3]], continued[[0, 1, 3]])
+    assert not torch.equal(after[0], first[0])
+
+
+def test_acting_leaves_no_gradient_and_no_changed_weight(folder: Path) -> None:
+    controller = Controller.load(folder)
+    before = {name: tensor.clone() for name, tensor in controller.actor.state_dict().items()}
+    controller.reset(4)
+    targets = replay(controller, golden_steps(folder)[0])
+    assert not targets.requires_grad
+    assert all(torch.equal(tensor, before[name]) for name, tensor in controller.actor.state_dict().items())
+
+
+def test_wrong_number_of_robots_is_refused(folder: Path) -> None:
+    controller = Controller.load(folder)
+    with pytest.raises(RuntimeError, match=r"reset\(4\)"):
+        replay(controller, golden_steps(folder)[0])
+
+
+def test_metrics_do_not_change_the_identity(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    before = content_hash(copy)
+    add_metrics(copy, {"E_v": 0.1})
+    assert content_hash(copy) == before
+    assert Controller.load(copy).provenance["metrics"] == {"E_v": 0.1}
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+def refused(folder: Path) -> str:
+    with pytest.raises(ControllerError) as error:
+        Controller.load(folder)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_empty_folder_is_refused(tmp_path: Path) -> None:
+    assert CONFIG_FILE in refused(tmp_path)
+
+
+def test_missing_weights_are_refused(copy: Path) -> None:
+    (copy / WEIGHTS_FILE).unlink()
+    assert "is missing" in refused(copy)
+
+
+def test_truncated_weights_are_refused(copy: Path) -> None:
+    (copy / WEIGHTS_FILE).write_bytes((copy / WEIGHTS_FILE).read_bytes()[:1000])
+    assert "damaged or truncated" in refused(copy)
+
+
+def test_weights_that_are_not_finite_are_refused_by_name(copy: Path) -> None:
+    tensors = load_file(copy / WEIGHTS_FILE)
+    tensors["head.first.weight"][0, 0] = float("nan")
+    save_file(tensors, copy / WEIGHTS_FILE)
+    assert "'head.first.weight'" in refused(copy)
+
+
+def test_weights_of_another_network_are_refused(copy: Path) -> None:
+    tensors = load_file(copy / WEIGHTS_FILE)
+    tensors["head.first.weight"] = tensors["head.first.weight"][:, :-1].contiguous()
+    save_file(tensors, copy / WEIGHTS_FILE)
+    assert "does not fit" in refused(copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d | {"format_version": 99}, "format version 99"),
+        (lambda d: d | {"config": {k: v for k, v in d["config"].items() if k != "stiffness"}}, "incomplete"),
+        (lambda d: d | {"config": d["config"] | {"joint_names": d["config"]["joint_names"][::-1]}}, "joint order"),
+    ],
+)
+def test_wrong_descriptions_are_refused(copy: Path, change, message: str) -> None:
+    description = json.loads((copy / CONFIG_FILE).read_text())
+    (copy / CONFIG_FILE).write_text(json.dumps(change(description)))
+    assert message in refused(copy)
+
+
+def test_damaged_json_is_refused(copy: Path) -> None:
+    (copy / CONFIG_FILE).write_text("{")
+    assert "damaged" in refused(copy)
