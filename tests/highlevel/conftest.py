@@ -15,7 +15,7 @@ from highlevel.task import load_task
 @pytest.fixture
 def coarse_physics() -> PhysicsConfig:
     """Cheap physics for tests of everything but physics."""
-    return PhysicsConfig(timestep=0.005, solver_iterations=4, num_threads=1)
+    return PhysicsConfig(timestep=0.005, solver_iterations=12, num_threads=1)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, HAND_BODIES, JOINT
 from robots.g1.mirror import ARMS_MIRROR
 from robots.g1.model import PALM_COLLISION, WORLD_COLLISION, ModelOptions, build_spec
 
-# Left arm with the palm vertical in front of the chest, found by inverse kinematics; the right one mirrors it.
+# Left arm with the palm vertical before the chest, from inverse kinematics; the right arm mirrors it.
 _LEFT_ARM = np.array([-0.16, 0.11, -0.01, 0.22, -0.13, 0.47, 0.03])
 _SQUEEZE = 0.15
 

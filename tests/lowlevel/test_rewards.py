@@ -1,0 +1,122 @@
+"""Reward terms against hand-computed values, and the error that names a bad term."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lowlevel.environment import EnvironmentConfig, PilotEnvironment
+from lowlevel.measures import Measurement, has_fallen, measure, stumbles, torso_error
+from lowlevel.rewards import REWARD_TERMS, RewardWeights, Transition, compute_rewards
+from lowlevel.rotations import from_roll_pitch_yaw
+
+
+@pytest.fixture(scope="module")
+def standing() -> Transition:
+    """Four robots that have just been reset, upright, at zero velocity command."""
+    environment = PilotEnvironment(EnvironmentConfig(num_robots=4, num_threads=1, start_in_posture=0.0))
+    environment.reset()
+    command = environment.command_space.neutral().repeat(4, 1)
+    zeros = torch.zeros(4, 29)
+    return Transition(
+        measured=measure(environment.simulation.read(), environment.terrain),
+        command=command,
+        flag=torch.ones(4, 1),
+        action=zeros,
+        previous_action=zeros,
+        nominal_target=zeros,
+        phase=torch.zeros(4),
+        walking=torch.zeros(4),
+        foot_air_time=torch.zeros(4, 2),
+        foot_contact_time=torch.zeros(4, 2),
+        fallen=torch.zeros(4, dtype=torch.bool),
+    )
+
+
+def moved(transition: Transition, **changes: torch.Tensor) -> Transition:
+    """The transition with some measured quantities replaced."""
+    robot = {name: value for name, value in changes.items() if hasattr(transition.measured.robot, name)}
+    derived = {name: value for name, value in changes.items() if name not in robot}
+    measured: Measurement = replace(transition.measured, robot=replace(transition.measured.robot, **robot), **derived)
+    return replace(transition, measured=measured)
+
+
+def term(name: str, transition: Transition) -> list[float]:
+    return REWARD_TERMS[name](transition).tolist()
+
+
+def test_tracking_kernels(standing: Transition) -> None:
+    velocity = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.3, 0.4, 9.0], [0.0, 0.0, 0.0]])
+    still = moved(standing, linear_velocity=velocity, yaw_rate=torch.tensor([0.0, 0.5, -1.0, 0.0]))
+    assert term("linear_velocity", still) == pytest.approx([1.0, 0.3679, 0.3679, 1.0], abs=1e-4)
+    assert term("angular_velocity", still) == pytest.approx([1.0, 0.3679, 0.1353, 1.0], abs=1e-4)
+    heights = moved(standing, base_height=torch.tensor([0.76, 0.71, 0.81, 0.66]))
+    assert term("base_height", heights) == pytest.approx([1.0, 0.3679, 0.3679, 0.1353], abs=1e-4)
+
+
+def test_torso_error_is_the_rotation_between_the_attitudes(standing: Transition) -> None:
+    command = standing.command.clone()
+    command[:, 4:7] = torch.tensor([0.1, 1.4, -0.5])
+    exact = moved(standing, torso_orientation=from_roll_pitch_yaw(command[:, 4:7]))
+    assert torso_error(exact.measured, command).abs().max() < 1e-6
+    pitched = moved(standing, torso_orientation=from_roll_pitch_yaw(torch.tensor([[0.0, 0.3, 0.0]]).repeat(4, 1)))
+    assert torch.allclose(
+        torso_error(pitched.measured, standing.command), torch.tensor([0.0, 0.3, 0.0]).expand(4, 3), atol=1e-6
+    )
+
+
+def test_contact_terms(standing: Transition) -> None:
+    contact = torch.tensor([[True, True], [True, False], [False, False], [True, True]])
+    velocity = torch.zeros(4, 2, 3)
+    velocity[:, 0, 0], velocity[:, 1, 1] = 0.3, 0.4
+    feet = moved(standing, foot_contact=contact, foot_velocity=velocity)
+    assert term("no_fly", feet) == [1.0, 0.0, 0.0, 1.0]
+    walking = replace(feet, command=feet.command.index_fill(1, torch.tensor([0]), 0.5))
+    assert term("no_fly", walking) == [0.0, 1.0, 0.0, 0.0]
+    assert term("feet_slippage", feet) == pytest.approx([0.7, 0.3, 0.0, 0.7])
+
+
+def test_air_time_counts_the_shorter_role_up_to_its_limit(standing: Transition) -> None:
+    walking = replace(
+        moved(standing, foot_contact=torch.tensor([[True, False]] * 4)),
+        command=standing.command.index_fill(1, torch.tensor([0]), 0.5),
+        foot_contact_time=torch.tensor([[0.1, 0.0], [0.3, 0.0], [0.9, 0.0], [0.2, 0.0]]),
+        foot_air_time=torch.tensor([[0.0, 0.2], [0.0, 0.2], [0.0, 0.9], [0.0, 0.2]]),
+    )
+    assert term("feet_air_time", walking) == pytest.approx([0.1, 0.2, 0.4, 0.2])
+    assert term("feet_air_time", replace(walking, command=standing.command)) == [0.0] * 4
+
+
+def test_stumbling_compares_sideways_with_vertical_force(standing: Transition) -> None:
+    force = torch.zeros(4, 2, 3)
+    force[0, 0] = torch.tensor([60.0, 0.0, 50.0])
+    force[1, 0] = torch.tensor([40.0, 0.0, 50.0])
+    force[2, 1] = torch.tensor([3.0, 0.0, 1.0])
+    contact = force.norm(dim=-1) > 5.0
+    assert stumbles(moved(standing, foot_force=force, foot_contact=contact).measured).tolist() == [
+        True,
+        False,
+        False,
+        False,
+    ]
+
+
+def test_a_step_of_the_command_is_not_a_fall_but_a_tilt_is(standing: Transition) -> None:
+    assert not has_fallen(standing.measured, standing.command).any()
+    tilted = moved(standing, torso_orientation=from_roll_pitch_yaw(torch.tensor([[1.0, 0.0, 0.0]]).repeat(4, 1)))
+    assert has_fallen(tilted.measured, standing.command).all()
+    sunk = moved(standing, base_height=torch.full((4,), 0.45))
+    assert has_fallen(sunk.measured, standing.command).all()
+
+
+def test_total_is_the_weighted_sum_per_second(standing: Transition) -> None:
+    weights = RewardWeights()
+    total, terms = compute_rewards(standing, weights, 0.02)
+    expected = sum(0.02 * getattr(weights, name) * value for name, value in terms.items())
+    assert torch.allclose(total, expected)
+
+
+def test_a_term_that_is_not_finite_is_named(standing: Transition) -> None:
+    broken = moved(standing, base_height=torch.tensor([0.7, float("nan"), 0.7, 0.7]))
+    with pytest.raises(FloatingPointError, match="'base_height' is not finite for robot 1"):
+        compute_rewards(broken, RewardWeights(), 0.02)
