@@ -81,6 +81,8 @@ class Arguments:
     """Robots side by side; the last digits of the figures depend on it."""
     threads: int = os.cpu_count() or 1
     """Physics threads."""
+    record: int = 0
+    """Also record this many of the first episodes for the rerun viewer."""
     write_metrics: bool = False
     """Also store the figures in the controller's own folder."""
 
@@ -115,6 +117,8 @@ def _run(arguments: Arguments) -> None:
     for name in ("episodes", "walk_episodes", "robots", "threads"):
         if getattr(arguments, name) < 1:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
+    if not 0 <= arguments.record <= min(arguments.robots, arguments.episodes):
+        raise ValueError("--record must be between 0 and the number of episodes and of robots")
     suite_terrain(arguments.suite)
     check_output(arguments.output)
     controller = Controller.load(arguments.controller)
@@ -122,7 +126,13 @@ def _run(arguments: Arguments) -> None:
     torch.set_num_threads(1)
     print(f"evaluating {arguments.controller} on the {arguments.suite} suite", flush=True)
     evaluation = evaluate(controller, content_hash(arguments.controller), arguments)
-    write_results(arguments.output, lambda folder: write_report(folder, evaluation))
+
+    def write(folder: Path) -> None:
+        write_report(folder, evaluation)
+        if arguments.record:
+            _record(controller, arguments, folder)
+
+    write_results(arguments.output, write)
     if arguments.write_metrics:
         stored = controller.provenance.get("metrics", {})
         figures = {name: asdict(figure) for name, figure in evaluation.figures.items()}
@@ -165,6 +175,16 @@ def evaluate(controller: Controller, identity: str, arguments: Arguments) -> Eva
         period=arena.period,
         seconds=time.monotonic() - began,
     )
+
+
+def _record(controller: Controller, arguments: Arguments, folder: Path) -> None:
+    from evaluation.recording import record_episodes  # the viewer's library is large and seldom needed here
+
+    terrain = suite_terrain(arguments.suite)
+    arena = Arena(controller, terrain, num_threads=arguments.threads, batch=arguments.robots)
+    space = controller.config.command_space
+    episodes = protocol_episodes(space, arguments.record, arguments.seed, len(terrain.tiles))
+    record_episodes(arena, episodes, folder)
 
 
 # -- report --------------------------------------------------------------------------------------------------

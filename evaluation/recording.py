@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
@@ -18,6 +20,7 @@ import rerun.blueprint as rrb
 import torch
 from torch import Tensor
 
+from evaluation.harness import Arena, Episode
 from evaluation.visuals import VISIBLE_GROUPS, VisualTwin
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.measures import Measurement
@@ -189,6 +192,30 @@ class EpisodeRecording:
         if stage != self._stage:
             self._stage = stage
             recorder.show_text("stage", stage)
+
+
+def record_episodes(arena: Arena, episodes: Sequence[Episode], folder: Path) -> list[Path]:
+    """Run a batch of low-level episodes and write one file for each; a repeated episode goes as before."""
+    twin = VisualTwin(arena.terrain.add_to)
+    network = arena.controller.config.network
+    experts = network.experts if network.mixture else 1
+    paths = [folder / f"episode_{number}.rrd" for number in range(len(episodes))]
+    with ExitStack() as stack:
+        films = [EpisodeRecording(stack.enter_context(Recorder(path)), twin, experts) for path in paths]
+        for moment in arena.run(episodes):
+            for row, film in enumerate(films):
+                if moment.active[row]:
+                    film.add(
+                        time=(moment.step + 1) * arena.period,
+                        simulation=arena.simulation,
+                        row=row,
+                        measured=moment.measured,
+                        command=moment.command,
+                        gate=moment.gate,
+                        elevation=moment.elevation,
+                        stage="fell" if moment.fell[row] else "",
+                    )
+    return paths
 
 
 def measured_posture(measured: Measurement) -> Tensor:

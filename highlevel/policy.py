@@ -70,7 +70,8 @@ class PlannerActor(nn.Module):
         """A copy of the actor of a policy that was built with :func:`policy_arguments`."""
         normaliser = policy.features_extractor
         assert isinstance(normaliser, Normaliser)
-        actor = cls(normaliser.features_dim, int(policy.action_net.weight.shape[0]), hidden)
+        action_size = policy.action_net.state_dict()["bias"].numel()
+        actor = cls(normaliser.features_dim, action_size, hidden)
         actor.hidden.load_state_dict(policy.mlp_extractor.policy_net.state_dict())
         actor.output.load_state_dict(policy.action_net.state_dict())
         actor.mean.copy_(normaliser.mean)

@@ -113,9 +113,7 @@ class Controller:
         self.provenance = provenance
         self.device = torch.device(device)
         self.actor = actor.to(device).eval().requires_grad_(False)
-        self.gains = Gains(
-            np.array(config.stiffness), np.array(config.damping), np.array(config.action_scale)
-        )
+        self.gains = Gains(np.array(config.stiffness), np.array(config.damping), np.array(config.action_scale))
         self.motion = NominalMotion(
             config.nominal,
             self.gains,
@@ -152,9 +150,7 @@ class Controller:
         memory.is_fresh[ids] = True
 
     @torch.no_grad()
-    def act(
-        self, proprioception: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor
-    ) -> Tensor:
+    def act(self, proprioception: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor) -> Tensor:
         """PD targets (N, 29) [rad] for the next control period.
 
         Args:
@@ -248,7 +244,9 @@ class Controller:
         description = _read_json(folder, CONFIG_FILE)
         version = description.get("format_version")
         if version != FORMAT_VERSION:
-            raise ControllerError(f"{folder / CONFIG_FILE} has format version {version}, this code reads {FORMAT_VERSION}")
+            raise ControllerError(
+                f"{folder / CONFIG_FILE} has format version {version}, this code reads {FORMAT_VERSION}"
+            )
         try:
             config = from_plain(ControllerConfig, description["config"])
         except (KeyError, TypeError, ValueError) as error:
@@ -323,7 +321,7 @@ def add_metrics(folder: Path | str, metrics: dict[str, Any]) -> None:
 
 
 def export_onnx(actor: PilotActor, path: Path) -> None:
-    """The policy network as ONNX: history, elevation_map, flag -> action, gate, velocity, latent; batch size is free."""
+    """The policy network as ONNX: (history, elevation_map, flag) to (action, gate, velocity, latent), any batch size."""
     sizes = actor.sizes
     rows = torch.export.Dim("robots")
     inputs = (torch.zeros(2, sizes.history), torch.zeros(2, sizes.elevation_map), torch.zeros(2, 1))

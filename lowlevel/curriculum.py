@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 from lowlevel.commands import CommandRange
 
@@ -32,9 +32,9 @@ STAGES: tuple[Stage, ...] = (
 class CurriculumConfig:
     """Where the ranges start and how they grow."""
 
-    start: CommandRange = CommandRange(velocity=0.4, height=0.1, torso=0.1, arms=0.0)
+    start: CommandRange = field(default_factory=lambda: CommandRange(velocity=0.4, height=0.1, torso=0.1, arms=0.0))
     """Opening of each range at the start; small instead of zero, so that no input is constant."""
-    growth: float = 0.02
+    growth: float = 0.004
     """Largest growth of a factor per update."""
     required_opening: float = 0.6
     """A stage grows only when the stage before it is open at least this far."""

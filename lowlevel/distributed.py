@@ -30,9 +30,7 @@ def start(device: str = "cpu") -> torch.device:
         raise ValueError("a CUDA device was asked for but PyTorch finds none; use device 'cpu'")
     announced = os.environ.get("WORLD_SIZE", "1")
     if not announced.isdigit():
-        raise ValueError(
-            f"WORLD_SIZE is {announced!r} but must be the number of processes; start with torchrun"
-        )
+        raise ValueError(f"WORLD_SIZE is {announced!r} but must be the number of processes; start with torchrun")
     if int(announced) > 1 and chosen.type == "cuda":
         chosen = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(chosen)

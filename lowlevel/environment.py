@@ -267,7 +267,11 @@ class PilotEnvironment:
 
     def _advance_nominal(self) -> None:
         state = self.motion.advance(self._nominal_state(), self.buffers.command)
-        self.buffers.reference, self.buffers.phase, self.buffers.walking = state.reference, state.phase, state.walking
+        self.buffers.reference, self.buffers.phase, self.buffers.walking = (
+            state.reference,
+            state.phase,
+            state.walking,
+        )
 
     def _update_foot_times(self, measured: Measurement) -> None:
         contact, period = measured.foot_contact, self.control_period

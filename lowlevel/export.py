@@ -1,19 +1,21 @@
-"""From a training run to a frozen controller folder."""
+"""From a training run to a frozen controller folder: ``python -m lowlevel.export RUN CONTROLLER``."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+import tyro
 
 from lowlevel.controller import Controller, ControllerConfig, actor_sizes
 from lowlevel.environment import PilotEnvironment
 from lowlevel.networks import NetworkConfig, PilotActor
 from lowlevel.observation import FRAME, normalised_columns
-from lowlevel.provenance import git_revision
-from lowlevel.trainer import Trainer
+from lowlevel.provenance import git_revision, read_training_config
+from lowlevel.trainer import STATE_FILE, Trainer
 from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
 
 
@@ -56,3 +58,21 @@ def freeze(trainer: Trainer) -> Controller:
 def export_controller(trainer: Trainer, folder: Path) -> None:
     """Freeze the current policy of ``trainer`` into a controller ``folder``."""
     freeze(trainer).save(folder)
+
+
+def export_run(run: Path, controller: Path) -> None:
+    """Freeze the last saved state of a training ``run``, which may still be going on, into a ``controller`` folder."""
+    config = read_training_config(run)
+    small = replace(config, environment=replace(config.environment, num_robots=config.ppo.minibatches))
+    trainer = Trainer(small, run)
+    trainer.load(run / STATE_FILE, with_environment=False)
+    trainer.config = config  # provenance tells of the run, not of the small environment it was rebuilt in
+    export_controller(trainer, controller)
+    print(f"{trainer.steps} steps; the controller lies in {controller}")
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(export_run)
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"lowlevel.export: {error}")

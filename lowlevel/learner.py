@@ -40,11 +40,11 @@ POLICY_KEYS = ("frame", "elevation_map", "flag", "velocity", "latent")
 class PPOConfig:
     """Settings of the learner."""
 
-    steps_per_update: int = 24
+    steps_per_update: int = 12
     """Control steps per robot and update."""
-    epochs: int = 5
+    epochs: int = 4
     """Passes over the rollout per update."""
-    minibatches: int = 6
+    minibatches: int = 4
     """Gradient steps per pass."""
     gamma: float = 0.99
     """Discount per control step."""
@@ -85,9 +85,7 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         if not 0 < self.estimator_epochs <= self.epochs:
-            raise ValueError(
-                f"estimator_epochs {self.estimator_epochs} is not between 1 and epochs {self.epochs}"
-            )
+            raise ValueError(f"estimator_epochs {self.estimator_epochs} is not between 1 and epochs {self.epochs}")
         if self.symmetry not in ("none", "augmentation", "loss"):
             raise ValueError(f"symmetry must be none, augmentation or loss, not {self.symmetry!r}")
         low, high = self.std_bounds

@@ -94,9 +94,7 @@ class MapEncoder(nn.Module):
         scores = torch.bmm(projected[:, :, self.features :], geometry)
         scores = torch.baddbmm(scores, projected[:, :, : self.features], features)
         weights = torch.softmax(scores, dim=-1).transpose(1, 2)
-        pooled = torch.cat([torch.bmm(part, weights) for part in (features, geometry)], dim=1).permute(
-            2, 0, 1
-        )
+        pooled = torch.cat([torch.bmm(part, weights) for part in (features, geometry)], dim=1).permute(2, 0, 1)
         value_weight = self.value_weight.unflatten(0, (self.heads, -1))
         values = torch.bmm(pooled, value_weight.transpose(1, 2)).transpose(0, 1)
         return self.output(values.flatten(1) + self.value_bias)

@@ -84,9 +84,7 @@ class NetworkConfig:
                 f"attention_width {self.attention_width} is not a multiple of {self.attention_heads} heads"
             )
         if any(window % 2 == 0 or window > MAP_SIDE for window in self.pooling_windows):
-            raise ValueError(
-                f"pooling windows must be odd and at most {MAP_SIDE}, not {self.pooling_windows}"
-            )
+            raise ValueError(f"pooling windows must be odd and at most {MAP_SIDE}, not {self.pooling_windows}")
 
 
 def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:

@@ -186,9 +186,7 @@ class PilotActor(nn.Module):
 class Critic(nn.Module):
     """Value of the privileged state, with its own observation scaling."""
 
-    def __init__(
-        self, sizes: ObservationSizes, config: NetworkConfig, command_columns: Tensor | None = None
-    ) -> None:
+    def __init__(self, sizes: ObservationSizes, config: NetworkConfig, command_columns: Tensor | None = None) -> None:
         """``command_columns`` (P,) bool: privileged columns that already have a fixed scale; default none."""
         super().__init__()
         self.normalizer = RunningNormalizer(sizes.privileged, command_columns)
@@ -211,9 +209,7 @@ class TargetEncoder(nn.Module):
 
     visible: Tensor
 
-    def __init__(
-        self, sizes: ObservationSizes, config: NetworkConfig, command_columns: Tensor | None = None
-    ) -> None:
+    def __init__(self, sizes: ObservationSizes, config: NetworkConfig, command_columns: Tensor | None = None) -> None:
         """``command_columns`` (P,) bool: privileged columns to hide; default none."""
         super().__init__()
         hidden = torch.zeros(sizes.privileged) if command_columns is None else command_columns.detach().cpu()

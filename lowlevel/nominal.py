@@ -63,6 +63,9 @@ class NominalConfig:
     rights the body."""
     step_damping: float = 0.27
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
+    lean: tuple[float, float] = (0.1, 0.25)
+    """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
+    chase it carry the robot along."""
 
 
 @dataclass
@@ -143,9 +146,7 @@ class NominalMotion:
         pitched = from_roll_pitch_yaw(torch.stack([zero, pitch, zero], -1))
         return multiply(from_roll_pitch_yaw(torso), conjugate(multiply(yawed, multiply(rolled, pitched))))
 
-    def joint_targets(
-        self, state: NominalState, projected_gravity: Tensor, base_angular_velocity: Tensor
-    ) -> Tensor:
+    def joint_targets(self, state: NominalState, projected_gravity: Tensor, base_angular_velocity: Tensor) -> Tensor:
         """Nominal PD targets (N, 29) [rad], gravity compensated by the table's static torques.
 
         ``projected_gravity`` (N, 3) and ``base_angular_velocity`` (N, 3) [rad/s] as measured, pelvis frame.
@@ -185,7 +186,12 @@ class NominalMotion:
                 targets[:, joint_index(f"{side}_{joint}_joint")] += offset
 
     def _add_balance(
-        self, targets: Tensor, state: NominalState, attitude: Tensor, gravity: Tensor, angular_velocity: Tensor
+        self,
+        targets: Tensor,
+        state: NominalState,
+        attitude: Tensor,
+        gravity: Tensor,
+        angular_velocity: Tensor,
     ) -> None:
         """Lean against the pelvis' tilt off its nominal ``attitude`` with the ankles and, marching, with steps.
 
@@ -195,7 +201,10 @@ class NominalMotion:
         config = self.config
         down = torch.zeros_like(gravity)
         down[:, 2] = -1.0
-        tilt = torch.linalg.cross(gravity, rotate_inverse(attitude, down))
+        wanted = rotate_inverse(attitude, down)
+        for axis, lean in enumerate(config.lean):
+            wanted[:, axis] += lean * state.reference[:, axis] * state.walking
+        tilt = torch.linalg.cross(gravity, wanted)
         ankle = config.balance_stiffness * tilt + config.balance_damping * angular_velocity
         capture = config.step_stiffness * tilt + config.step_damping * angular_velocity
         swing = torch.sin(state.phase) * state.walking

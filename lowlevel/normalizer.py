@@ -23,9 +23,7 @@ class RunningNormalizer(nn.Module):
     count: Tensor
     fixed: Tensor
 
-    def __init__(
-        self, size: int, fixed: Tensor | None = None, floor: float = 1e-2, clip: float = 10.0
-    ) -> None:
+    def __init__(self, size: int, fixed: Tensor | None = None, floor: float = 1e-2, clip: float = 10.0) -> None:
         """``fixed`` (D,) bool, default none; ``floor`` is added to the deviation; ``clip`` in deviations.
 
         Raises:

@@ -138,9 +138,7 @@ class PPO:
         where = f"at rollout step {self.storage.position}"
         require_finite(f"reward {where}", reward)
         require_finite(f"next privileged observation {where}", next_privileged)
-        self.storage.write(
-            {"reward": reward.to(self.device), "next_privileged": next_privileged.to(self.device)}
-        )
+        self.storage.write({"reward": reward.to(self.device), "next_privileged": next_privileged.to(self.device)})
         self.storage.finish_step(terminated.to(self.device), truncated.to(self.device))
 
     def update(self, observation_after: Mapping[str, Tensor]) -> dict[str, float]:
@@ -267,9 +265,7 @@ class PPO:
         if self.config.symmetry == "none":
             return None
         share = max(1, int(self.config.mirror_loss_share * len(index)))
-        return {
-            name: self._rows(name).index_select(0, index[-share:] + self.storage.size) for name in POLICY_KEYS
-        }
+        return {name: self._rows(name).index_select(0, index[-share:] + self.storage.size) for name in POLICY_KEYS}
 
     def _rows(self, name: str) -> Tensor:
         if name == "frame":
@@ -279,9 +275,7 @@ class PPO:
     @torch.no_grad()
     def _estimator_drift(self) -> float:
         """KL divergence of the policy [nat] that the estimator's own learning caused, on the last samples."""
-        recorded = {
-            key: self.storage.flat(key)[-self._minibatch :] for key in (*ACTOR_KEYS, *POLICY_KEYS[3:])
-        }
+        recorded = {key: self.storage.flat(key)[-self._minibatch :] for key in (*ACTOR_KEYS, *POLICY_KEYS[3:])}
         recorded["frame"] = recorded["history"][:, -self.sizes.frame :]
         with self.learner.autocast():
             before, _ = self.actor.decide(*(recorded[key] for key in POLICY_KEYS))

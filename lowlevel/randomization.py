@@ -78,9 +78,7 @@ class RandomizationState:
 class Randomizer:
     """Draws episode parameters and writes them into the simulation."""
 
-    def __init__(
-        self, config: RandomizationConfig, simulation: BatchSimulation, generator: torch.Generator
-    ) -> None:
+    def __init__(self, config: RandomizationConfig, simulation: BatchSimulation, generator: torch.Generator) -> None:
         self.config = config
         self.simulation = simulation
         self.generator = generator
@@ -128,7 +126,10 @@ class Randomizer:
         if config.gain_scale != (1.0, 1.0):
             stiffness = self._uniform(*config.gain_scale, count, NUM_JOINTS).cpu().numpy()
             damping = self._uniform(*config.gain_scale, count, NUM_JOINTS).cpu().numpy()
-            gain, bias = self.simulation.per_robot("actuator_gainprm"), self.simulation.per_robot("actuator_biasprm")
+            gain, bias = (
+                self.simulation.per_robot("actuator_gainprm"),
+                self.simulation.per_robot("actuator_biasprm"),
+            )
             gain[rows, self._actuators, 0] = self._gain[None, self._actuators, 0] * stiffness
             bias[rows, self._actuators, 1] = self._bias[None, self._actuators, 1] * stiffness
             bias[rows, self._actuators, 2] = self._bias[None, self._actuators, 2] * damping
@@ -147,7 +148,7 @@ class Randomizer:
         self.simulation.update_constants(ids)
 
     def disturb(self, robot: RobotState, heading: Tensor) -> Tensor:
-        """Apply hand loads and due pushes for the next control step; returns hand forces (N, 2, 3) [N], heading frame."""
+        """Apply hand loads and due pushes for the next step; returns hand forces (N, 2, 3) [N], heading frame."""
         state, config = self.state, self.config
         force = torch.zeros(len(heading), 2, 3, device=heading.device)
         if config.hand_load_probability > 0.0:

@@ -55,8 +55,7 @@ class RolloutStorage:
         rows = self.size * (2 if images else 1)
         self._samples = {name: torch.zeros(rows, *shape, device=device) for name, shape in shapes.items()}
         self.data = {
-            name: rows[: self.size].view(steps, num_envs, *shapes[name])
-            for name, rows in self._samples.items()
+            name: rows[: self.size].view(steps, num_envs, *shapes[name]) for name, rows in self._samples.items()
         }
         self.terminated = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
@@ -108,6 +107,4 @@ class RolloutStorage:
 
     def _require_room(self) -> None:
         if self.full:
-            raise ValueError(
-                f"the rollout already holds its {self.steps} steps; call update() before acting again"
-            )
+            raise ValueError(f"the rollout already holds its {self.steps} steps; call update() before acting again")

@@ -16,7 +16,7 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from robots.g1.constants import FOOT_BODIES, HAND_BODIES, JOINT_NAMES, PELVIS_BODY, SIDES, TORSO_BODY
+from robots.g1.constants import HAND_BODIES, JOINT_NAMES, PELVIS_BODY, SIDES, TORSO_BODY
 from robots.g1.model import effort_limits, joint_limits
 
 
@@ -90,9 +90,7 @@ class BatchSimulation:
         self._actuators = _contiguous([model.actuator(name).id for name in JOINT_NAMES])
         self._base_qpos, self._base_qvel = self._free_joint_slices(PELVIS_BODY)
         self._sensor_columns = {
-            model.sensor(i).name: slice(
-                int(model.sensor_adr[i]), int(model.sensor_adr[i]) + int(model.sensor_dim[i])
-            )
+            model.sensor(i).name: slice(int(model.sensor_adr[i]), int(model.sensor_adr[i]) + int(model.sensor_dim[i]))
             for i in range(model.nsensor)
         }
         self._per_robot_fields: dict[str, np.ndarray] = {}

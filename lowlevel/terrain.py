@@ -100,7 +100,10 @@ class Terrain:
 
     def _rasterise(self) -> np.ndarray:
         config, resolution = self.config, self.config.raster_resolution
-        shape = (round(config.tile_size / resolution), round(config.tile_size * len(config.tiles) / resolution))
+        shape = (
+            round(config.tile_size / resolution),
+            round(config.tile_size * len(config.tiles) / resolution),
+        )
         raster = np.zeros(shape, dtype=np.float32)
         origin = self._origin.cpu().numpy()
         for block in self.blocks:

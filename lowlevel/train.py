@@ -53,7 +53,7 @@ def _run(arguments: list[str]) -> None:
         Arguments,
         args=arguments,
         default=Arguments(config=config, preset=chosen.preset),
-        description="Train a PILOT controller. The defaults below are those of the chosen preset, or of the resumed run.",
+        description="Train a PILOT controller. Defaults below are those of the chosen preset or resumed run.",
     )
     device = distributed.start(parsed.config.device)
     # Physics and learning take turns on the same cores.

@@ -194,16 +194,17 @@ class Trainer:
             atomic_write(path, lambda file: torch.save(state, file))
         return path
 
-    def load(self, path: Path) -> None:
-        """Continue from a training state that :meth:`save` wrote.
+    def load(self, path: Path, with_environment: bool = True) -> None:
+        """Continue from a training state that :meth:`save` wrote; without its environment the robots start anew.
 
         Raises:
             ValueError: if the file is damaged or belongs to another configuration.
         """
         state = read_training_state(path)
         self.load_learning(state)
-        self.environment.load_state_dict(state["environment"])
-        self.observation = state["observation"]
+        if with_environment:
+            self.environment.load_state_dict(state["environment"])
+            self.observation = state["observation"]
         self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
 
     def load_learning(self, state: dict[str, Any]) -> None:
@@ -240,7 +241,12 @@ class Trainer:
 
     @contextmanager
     def _progress(self) -> Iterator[tuple[Progress, Any]]:
-        columns = (BarColumn(), TextColumn("{task.percentage:>5.1f}%"), TimeElapsedColumn(), TimeRemainingColumn())
+        columns = (
+            BarColumn(),
+            TextColumn("{task.percentage:>5.1f}%"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
         with Progress(*columns, TextColumn("{task.description}"), disable=rank() != 0) as progress:
             yield progress, progress.add_task("starting", total=self.config.total_steps, completed=self.steps)
 
@@ -282,9 +288,7 @@ def read_training_state(path: Path) -> dict[str, Any]:
 
 
 def _tracking(result: StepResult) -> dict[str, Tensor]:
-    return {
-        name: function(result.measured, result.command) for name, (_, function) in TRACKING_FIGURES.items()
-    }
+    return {name: function(result.measured, result.command) for name, (_, function) in TRACKING_FIGURES.items()}
 
 
 def _drop_entries_after(path: Path, steps: int) -> None:

@@ -16,6 +16,9 @@ from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
 from robots.g1.model import build_spec, joint_limits
 from robots.g1.nominal_pose import NominalPose
 
+# Matrices are small here, and idle threads that spin slow everything down several-fold on a busy machine.
+torch.set_num_threads(1)
+
 
 @pytest.fixture(scope="session")
 def untrained_controller(tmp_path_factory: pytest.TempPathFactory) -> Path:

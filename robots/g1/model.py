@@ -56,7 +56,7 @@ class ModelOptions:
     """Sliding friction coefficient of floor, feet and palms."""
 
 
-def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:  # noqa: B008 (frozen)
+def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:
     """The robot as an editable MuJoCo specification; ``.compile()`` gives nq 36, nv 35, nu 29.
 
     Raises:

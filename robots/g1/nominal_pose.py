@@ -124,9 +124,7 @@ class NominalPose:
         half_yaw = Axis(0.0, yaw_axis.stop, yaw_axis.size // 2 + 1)
         height = posture[:, 0].clamp(height_axis.start, height_axis.stop)
         yaw = posture[:, 3].clamp(yaw_axis.start, yaw_axis.stop)
-        limit = interpolate(
-            (height_axis, half_yaw), self.roll_limit, torch.stack([height, yaw.abs()], dim=1)
-        )[:, 0]
+        limit = interpolate((height_axis, half_yaw), self.roll_limit, torch.stack([height, yaw.abs()], dim=1))[:, 0]
         roll = torch.minimum(torch.maximum(posture[:, 1], -limit), limit)
         where = torch.stack([height, roll.abs(), yaw.abs()], dim=1)
         lower, upper = interpolate((height_axis, half_roll, half_yaw), self.pitch_limits, where).unbind(1)

@@ -129,9 +129,7 @@ def command_limits(safe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     roll_limit = np.empty((heights + 1, yaws + 1))
     pitch_limits = np.empty((heights + 1, rolls + 1, yaws + 1, 2))
     for h, y in np.ndindex(roll_limit.shape):
-        around = [
-            cell for cell in itertools.product((h - 1, h), (y - 1, y)) if _inside(cell, available.shape)
-        ]
+        around = [cell for cell in itertools.product((h - 1, h), (y - 1, y)) if _inside(cell, available.shape)]
         roll_limit[h, y] = ROLL[_CENTRE[1] + min(available[cell] for cell in around)]
         for r in range(rolls + 1):
             touching = [pitches[i, j, k] for i, k in around for j in (r - 1, r) if 0 <= j < available[i, k]]

@@ -97,8 +97,7 @@ class StanceSolver:
         self._feet = [self.model.getFrameId(name) for name in FOOT_BODIES]
         self._torso = self.model.getFrameId(TORSO_BODY)
         self._foot_targets = [
-            pin.SE3(np.eye(3), np.array([0.0, side * STANCE_HALF_WIDTH, -SOLE_OFFSET]))
-            for side in (1.0, -1.0)
+            pin.SE3(np.eye(3), np.array([0.0, side * STANCE_HALF_WIDTH, -SOLE_OFFSET])) for side in (1.0, -1.0)
         ]
         self.lower_limit = self.model.lowerPositionLimit[7:][LOWER_JOINTS].copy()
         self.upper_limit = self.model.upperPositionLimit[7:][LOWER_JOINTS].copy()
@@ -110,14 +109,10 @@ class StanceSolver:
 
         A posture that cannot be reached gives a stance that is not sound, not an error.
         """
-        unknowns = (
-            np.concatenate([np.zeros(4), DEFAULT_POSITION[LOWER_JOINTS]]) if start is None else start.copy()
-        )
+        unknowns = np.concatenate([np.zeros(4), DEFAULT_POSITION[LOWER_JOINTS]]) if start is None else start.copy()
         for iteration in range(_MAX_ITERATIONS):
             residual, jacobian = self._residual(posture, unknowns)
-            step = np.linalg.solve(
-                jacobian.T @ jacobian + 1e-6 * np.eye(len(unknowns)), -jacobian.T @ residual
-            )
+            step = np.linalg.solve(jacobian.T @ jacobian + 1e-6 * np.eye(len(unknowns)), -jacobian.T @ residual)
             largest = float(np.abs(step).max())
             # Full steps restore the feet at once; shorter ones later stop cycling between active limits.
             step *= min(1.0 if iteration < 15 else 0.3, _MAX_STEP / largest)
@@ -154,8 +149,7 @@ class StanceSolver:
         q[7:][LOWER_JOINTS] = joints
         pin.framesForwardKinematics(self.model, self.data, q)
         left, right = (
-            target * self.data.oMf[foot].inverse()
-            for foot, target in zip(self._feet, self._foot_targets, strict=True)
+            target * self.data.oMf[foot].inverse() for foot, target in zip(self._feet, self._foot_targets, strict=True)
         )
         pelvis = pin.SE3.Interpolate(left, right, 0.5)
         roll, pitch, yaw = pin.rpy.matrixToRpy(pelvis.rotation)

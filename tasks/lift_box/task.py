@@ -115,7 +115,7 @@ class LiftBox(Task):
         return Outcome(reward, success, dropped)
 
     def look(self, measured: Measurement) -> Situation:
-        # The sensor reports the force that the box exerts on the palm's side of the pair; see the tests.
+        # The force that each hand exerts on the box; the tests pin the sign.
         force = torch.stack([self._simulation.sensor(name) for name in FORCE_SENSORS], dim=1)
         return observe_situation(measured, self._simulation.object_pose(BOX), self.episode.size, force)
 

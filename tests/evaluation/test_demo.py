@@ -11,7 +11,7 @@ from evaluation.demo import Arguments, Story, main, outcome_text, run_episode
 
 
 def test_the_story_is_that_of_the_numbered_episode(untrained_controller: Path, tmp_path: Path) -> None:
-    stories = []
+    stories: list[Story] = []
     for number in (0, 1, 1):
         arguments = Arguments("scripted", seed=2, episode=number, threads=1)
         story, twin = run_episode(arguments, untrained_controller, tmp_path / f"{len(stories)}.rrd")

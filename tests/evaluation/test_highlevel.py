@@ -65,7 +65,7 @@ def test_negative_controls_change_nothing_else() -> None:
         after = with_control(task, name).describe()
         assert after.pop("control") == name
         assert after == {key: value for key, value in before.items() if key != "control"}
-    del task.config
+    del task.config  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match="has no negative controls"):
         control_names(task)
 

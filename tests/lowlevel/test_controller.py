@@ -155,7 +155,10 @@ def test_weights_of_another_network_are_refused(copy: Path) -> None:
     [
         (lambda d: d | {"format_version": 99}, "format version 99"),
         (lambda d: d | {"config": {k: v for k, v in d["config"].items() if k != "stiffness"}}, "incomplete"),
-        (lambda d: d | {"config": d["config"] | {"joint_names": d["config"]["joint_names"][::-1]}}, "joint order"),
+        (
+            lambda d: d | {"config": d["config"] | {"joint_names": d["config"]["joint_names"][::-1]}},
+            "joint order",
+        ),
     ],
 )
 def test_wrong_descriptions_are_refused(copy: Path, change, message: str) -> None:

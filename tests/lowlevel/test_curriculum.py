@@ -17,7 +17,7 @@ def test_nothing_opens_while_robots_fall() -> None:
 def test_stages_open_in_order_until_everything_is_open() -> None:
     curriculum = Curriculum(CurriculumConfig())
     opened: list[str] = []
-    for _ in range(300):
+    for _ in range(1500):
         before = asdict(curriculum.open_range)
         curriculum.update(GOOD, survival=1.0)
         opened += [k for k, v in asdict(curriculum.open_range).items() if v > before[k] and k not in opened]
@@ -27,7 +27,7 @@ def test_stages_open_in_order_until_everything_is_open() -> None:
 
 def test_a_stage_waits_for_its_own_tracking() -> None:
     curriculum = Curriculum(CurriculumConfig())
-    for _ in range(300):
+    for _ in range(1500):
         curriculum.update(GOOD | {"base_height": 0.0}, survival=1.0)
     assert curriculum.open_range.velocity == 1.0
     assert curriculum.open_range.height == CurriculumConfig().start.height

@@ -87,9 +87,7 @@ def test_two_ranks_learn_what_one_process_learns_from_all_robots(tmp_path: Path)
     for rank in (first, second):
         actual = _flat({module: rank["state"][module] for module in modules})
         for name, value in expected.items():
-            torch.testing.assert_close(
-                actual[name], value, rtol=1e-5, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}"
-            )
+            torch.testing.assert_close(actual[name], value, rtol=1e-5, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}")
         assert rank["figures"]["kl"] == pytest.approx(single["figures"]["kl"], rel=1e-3)  # type: ignore[index]
         assert rank["figures"]["learning_rate"] == single["figures"]["learning_rate"]  # type: ignore[index]
     ours, theirs = (_flat(rank["state"]["actor"]) for rank in (first, second))

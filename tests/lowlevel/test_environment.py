@@ -10,7 +10,15 @@ from lowlevel.controller import Controller, Proprioception
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 from lowlevel.export import freeze
 from lowlevel.measures import TRACKING_FIGURES, measure
-from lowlevel.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, MIRRORS, PRIVILEGED_SIZE, NoiseConfig, split_frame
+from lowlevel.observation import (
+    FRAME,
+    FRAME_SIZE,
+    HISTORY_LENGTH,
+    MIRRORS,
+    PRIVILEGED_SIZE,
+    NoiseConfig,
+    split_frame,
+)
 from lowlevel.ppo import PPOConfig
 from lowlevel.randomization import RandomizationConfig
 from lowlevel.rewards import REWARD_TERMS, RewardWeights
@@ -63,7 +71,10 @@ def test_restored_state_continues_bit_exactly() -> None:
     environment = PilotEnvironment(replace(SMALL, terrain=TerrainConfig(tiles=("irregular",))), seed=5)
     roll_out(environment, 15)
     saved = environment.state_dict()
-    saved = {key: ({k: v.clone() for k, v in value.items()} if isinstance(value, dict) else value) for key, value in saved.items()}
+    saved = {
+        key: ({k: v.clone() for k, v in value.items()} if isinstance(value, dict) else value)
+        for key, value in saved.items()
+    }
     actions = 0.3 * torch.randn(40, 6, 29)
     expected = [environment.step(action) for action in actions]
     other = PilotEnvironment(replace(SMALL, terrain=TerrainConfig(tiles=("irregular",))), seed=99)
@@ -162,7 +173,10 @@ def test_frozen_controller_repeats_the_training_policy(tmp_path) -> None:
         robot = measured.robot
         targets = controller.act(
             Proprioception(
-                robot.joint_position, robot.joint_velocity, robot.base_angular_velocity, measured.projected_gravity
+                robot.joint_position,
+                robot.joint_velocity,
+                robot.base_angular_velocity,
+                measured.projected_gravity,
             ),
             environment.buffers.elevation + 0.75,
             environment.buffers.command,

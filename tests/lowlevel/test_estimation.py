@@ -42,9 +42,7 @@ def test_contrastive_term_is_the_swapped_cross_entropy_summed_over_prototypes() 
 def test_ignorance_costs_the_logarithm_of_the_number_of_prototypes() -> None:
     latent = functional.normalize(torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(32, 1), dim=1)
     prototypes = functional.normalize(torch.cat([torch.zeros(8, 2), torch.randn(8, 2)], dim=1), dim=1)
-    terms = estimation_loss(
-        torch.zeros(32, 3), latent, torch.zeros(32, 3), latent, prototypes, EstimationConfig()
-    )
+    terms = estimation_loss(torch.zeros(32, 3), latent, torch.zeros(32, 3), latent, prototypes, EstimationConfig())
     assert float(terms.contrastive) == pytest.approx(math.log(8), rel=1e-4)
     assert float(terms.assignment_entropy) == pytest.approx(1.0, rel=1e-4)
 
@@ -117,7 +115,5 @@ def test_estimator_learns_only_in_its_epochs_and_from_its_own_loss() -> None:
         assert ("estimator" in losses) == estimating
         before = [p.clone() for p in ppo.learner.groups["estimator"]]
         ppo.learner.step(losses)
-        changed = [
-            not torch.equal(a, b) for a, b in zip(before, ppo.learner.groups["estimator"], strict=True)
-        ]
+        changed = [not torch.equal(a, b) for a, b in zip(before, ppo.learner.groups["estimator"], strict=True)]
         assert any(changed) == estimating

@@ -44,9 +44,7 @@ def test_attention_equals_multi_head_attention_with_explicit_keys_and_values() -
     actual = encoder.attend(query, features, geometry)
     assert weights.max() > 0.1, "attention is so flat that the comparison would prove little"
     torch.testing.assert_close(actual, expected.squeeze(1), rtol=1e-4, atol=1e-5)
-    gradients = [
-        torch.autograd.grad(out.square().sum(), query, retain_graph=True)[0] for out in (actual, expected)
-    ]
+    gradients = [torch.autograd.grad(out.square().sum(), query, retain_graph=True)[0] for out in (actual, expected)]
     torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-3, atol=1e-4)
 
 
@@ -80,9 +78,7 @@ def test_mixture_is_the_probability_weighted_sum_of_separate_experts() -> None:
     expected = torch.zeros(9, 7)
     for expert in range(4):
         rows = slice(12 * expert, 12 * (expert + 1))
-        hidden = functional.elu(
-            functional.linear(inputs, mixture.first.weight[rows], mixture.first.bias[rows])
-        )
+        hidden = functional.elu(functional.linear(inputs, mixture.first.weight[rows], mixture.first.bias[rows]))
         hidden = functional.elu(hidden @ mixture.second_weight[expert] + mixture.second_bias[expert])
         proposal = hidden @ mixture.output_weight[expert] + mixture.output_bias[expert]
         expected += gate[:, expert : expert + 1] * proposal

@@ -99,7 +99,9 @@ def test_march_lifts_the_swing_leg_only(space: CommandSpace) -> None:
 def test_ankles_push_against_tilt_and_vanish_at_the_nominal_attitude(space: CommandSpace) -> None:
     nominal, without = motion(), motion(balance_stiffness=0.0)
     state = nominal.initial_state(space.neutral()[None])
-    attitude = nominal.pelvis_attitude(state.reference[:, TORSO], nominal.pose.lookup(state.reference[:, 3:7])[0][:, WAIST_JOINTS])
+    attitude = nominal.pelvis_attitude(
+        state.reference[:, TORSO], nominal.pose.lookup(state.reference[:, 3:7])[0][:, WAIST_JOINTS]
+    )
     rotation = pin.Quaternion(*attitude[0].double().tolist()).toRotationMatrix()
     nominal_gravity = torch.tensor(rotation.T @ np.array([0, 0, -1.0]), dtype=torch.float32)[None]
     base = without.joint_targets(state, nominal_gravity, STILL)

@@ -114,9 +114,7 @@ def test_mirror_images_are_consistent_with_the_mirrors() -> None:
     assert torch.equal(samples["action"][5:], storage.flat("action")[5:10])
     images = ppo._images(torch.arange(12))
     assert images is not None
-    assert torch.equal(
-        images["frame"], ppo.mirrors("history", storage.flat("history")[9:12])[:, -SIZES.frame :]
-    )
+    assert torch.equal(images["frame"], ppo.mirrors("history", storage.flat("history")[9:12])[:, -SIZES.frame :])
 
 
 def test_tensor_mirrors_check_what_they_are_given() -> None:

@@ -67,7 +67,7 @@ def test_flat_ground_needs_no_raster() -> None:
 
 
 def test_unknown_tile_is_named() -> None:
-    with pytest.raises(ValueError, match="'lava'.*flat"):
+    with pytest.raises(ValueError, match=r"'lava'.*flat"):
         Terrain(TerrainConfig(tiles=("lava",)))
 
 

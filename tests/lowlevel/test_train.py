@@ -22,7 +22,12 @@ from lowlevel.train import main
 from lowlevel.trainer import LOG_FILE, STATE_FILE, Trainer, TrainingConfig
 
 TINY_NETWORK = NetworkConfig(
-    history_hidden=(16,), map_hidden=8, map_global=4, expert_hidden=(16, 8), critic_hidden=(16,), target_hidden=(16,)
+    history_hidden=(16,),
+    map_hidden=8,
+    map_global=4,
+    expert_hidden=(16, 8),
+    critic_hidden=(16,),
+    target_hidden=(16,),
 )
 
 
@@ -76,7 +81,9 @@ def test_reward_rises_in_a_short_run(tmp_path: Path) -> None:
     config = replace(
         tiny(),
         environment=EnvironmentConfig(
-            num_robots=128, num_threads=2, mixture=replace(EnvironmentConfig().mixture, walk_and_work=0.0, stand_and_work=1.0)
+            num_robots=128,
+            num_threads=2,
+            mixture=replace(EnvironmentConfig().mixture, walk_and_work=0.0, stand_and_work=1.0),
         ),
         ppo=replace(TrainingConfig().ppo, steps_per_update=16, minibatches=4),
     )

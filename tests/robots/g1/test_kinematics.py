@@ -69,14 +69,10 @@ def test_limits_and_masses_agree(mujoco_model: mujoco.MjModel) -> None:
     assert mujoco_model.body_mass.sum() == pytest.approx(pin.computeTotalMass(model), abs=1e-9)
 
 
-def test_forward_kinematics_agree(
-    mujoco_model: mujoco.MjModel, states: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_forward_kinematics_agree(mujoco_model: mujoco.MjModel, states: tuple[np.ndarray, np.ndarray]) -> None:
     data, kinematics = mujoco.MjData(mujoco_model), Kinematics()
     offsets = dict.fromkeys(FRAMES, np.zeros(3)) | dict.fromkeys(PALM_FRAMES, np.array(constants.PALM_OFFSET))
-    bodies = dict(zip(FRAMES, FRAMES, strict=True)) | dict(
-        zip(PALM_FRAMES, constants.HAND_BODIES, strict=True)
-    )
+    bodies = dict(zip(FRAMES, FRAMES, strict=True)) | dict(zip(PALM_FRAMES, constants.HAND_BODIES, strict=True))
     for qpos, qvel in zip(*states, strict=True):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(mujoco_model, data)
@@ -103,9 +99,7 @@ def test_mass_matrices_agree(mujoco_model: mujoco.MjModel, states: tuple[np.ndar
         np.testing.assert_allclose(mass[upper], expected[upper], atol=1e-6)
 
 
-def test_gravity_and_velocity_forces_agree(
-    mujoco_model: mujoco.MjModel, states: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_gravity_and_velocity_forces_agree(mujoco_model: mujoco.MjModel, states: tuple[np.ndarray, np.ndarray]) -> None:
     """``qfrc_bias`` equals Pinocchio's inverse dynamics: velocities are right inside the dynamics too.
 
     MuJoCo's acceleration coordinates are not Pinocchio's: with linear velocity v = R^T u, dv/dt = R^T du/dt -

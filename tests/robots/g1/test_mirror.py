@@ -130,9 +130,7 @@ def test_mirrored_dynamics(configurations: np.ndarray) -> None:
             v, last = rng.normal(size=35), scale * rng.normal(size=35)
             expected.append(VELOCITY_MIRROR(algorithm(model, data, q, v, last)))
             reached.append(
-                algorithm(
-                    model, data, CONFIGURATION_MIRROR(q), VELOCITY_MIRROR(v), VELOCITY_MIRROR(last)
-                ).copy()
+                algorithm(model, data, CONFIGURATION_MIRROR(q), VELOCITY_MIRROR(v), VELOCITY_MIRROR(last)).copy()
             )
         error = np.abs(np.array(expected) - np.array(reached)).max(axis=0)
         assert (error < DYNAMICS_TOLERANCE * np.abs(expected).max(axis=0)).all(), error

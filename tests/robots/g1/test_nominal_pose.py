@@ -27,9 +27,7 @@ LOWEST = np.array([0.30, -0.4, -0.3, -1.5])
 HIGHEST = np.array([0.76, 0.4, 1.5, 1.5])
 """The paper's ranges of height [m], roll, pitch and yaw [rad]."""
 
-DIRECTIONS = np.stack(
-    [np.cos(np.linspace(0, 2 * np.pi, 721)), np.sin(np.linspace(0, 2 * np.pi, 721))], axis=1
-)
+DIRECTIONS = np.stack([np.cos(np.linspace(0, 2 * np.pi, 721)), np.sin(np.linspace(0, 2 * np.pi, 721))], axis=1)
 
 
 @dataclass(frozen=True)
@@ -227,9 +225,7 @@ def test_clamp_moves_continuously(poses: NominalPose) -> None:
     The steepest limit changes by 0.6 rad of pitch over 0.038 m of height, that is 15.7 rad/m.
     """
     postures = random_postures(20000)
-    nudge = 1e-3 * torch.nn.functional.normalize(
-        torch.randn(20000, 4, generator=torch.Generator().manual_seed(0))
-    )
+    nudge = 1e-3 * torch.nn.functional.normalize(torch.randn(20000, 4, generator=torch.Generator().manual_seed(0)))
     moved = (poses.clamp(postures + nudge) - poses.clamp(postures)).abs().max()
     assert moved < 0.020
 
@@ -239,9 +235,7 @@ def test_mirrored_posture_gives_the_mirrored_pose(poses: NominalPose) -> None:
     flip = torch.tensor([1.0, -1.0, 1.0, -1.0])
     for values, mirrored in zip(poses.lookup(postures), poses.lookup(postures * flip), strict=True):
         np.testing.assert_allclose(mirrored, LOWER_MIRROR(values.numpy()), atol=2e-4)
-    torch.testing.assert_close(
-        poses.clamp(postures * flip), poses.clamp(postures) * flip, atol=1e-6, rtol=0.0
-    )
+    torch.testing.assert_close(poses.clamp(postures * flip), poses.clamp(postures) * flip, atol=1e-6, rtol=0.0)
 
 
 def test_sound_nodes_stand(judge: Judge, table: dict[str, np.ndarray]) -> None:
@@ -278,17 +272,13 @@ def test_clamped_postures_stand(judge: Judge, poses: NominalPose) -> None:
     assert np.percentile(foot_errors, 99) < 0.01  # measured 0.0053
     assert foot_errors.max() < 0.05  # measured 0.017 here, 0.040 over other seeds
     assert max(verdict.torso_error for verdict in verdicts) < 0.03  # measured 0.012
-    heights = [
-        abs(verdict.height - float(posture[0])) for verdict, posture in zip(verdicts, postures, strict=True)
-    ]
+    heights = [abs(verdict.height - float(posture[0])) for verdict, posture in zip(verdicts, postures, strict=True)]
     assert max(heights) < 0.01  # measured 0.004
     assert min(verdict.com_margin for verdict in verdicts) >= COM_MARGIN  # measured 0.0206
     assert max(verdict.imbalance for verdict in verdicts) < 1.0  # measured 0.21
     assert (torques.abs().numpy() <= judge.effort).all()
     lower, upper = judge.limits.T
-    assert (positions.numpy() > lower + LIMIT_MARGIN).all() and (
-        positions.numpy() < upper - LIMIT_MARGIN
-    ).all()
+    assert (positions.numpy() > lower + LIMIT_MARGIN).all() and (positions.numpy() < upper - LIMIT_MARGIN).all()
     assert not any(not (_is_arm(a) or _is_arm(b)) for verdict in verdicts for a, b in verdict.contacts)
 
 
@@ -332,9 +322,7 @@ def test_unsound_nodes_hold_a_sound_neighbour(table: dict[str, np.ndarray]) -> N
     np.testing.assert_array_equal(values, table["positions"])
 
 
-@pytest.mark.parametrize(
-    "damage", ["missing", "truncated", "text", "incomplete", "not finite", "wrong shape"]
-)
+@pytest.mark.parametrize("damage", ["missing", "truncated", "text", "incomplete", "not finite", "wrong shape"])
 def test_bad_table_is_refused(tmp_path: Path, table: dict[str, np.ndarray], damage: str) -> None:
     path = tmp_path / "table.npz"
     error: type[Exception] = ValueError
@@ -359,8 +347,6 @@ def test_bad_table_is_refused(tmp_path: Path, table: dict[str, np.ndarray], dama
 
 
 def test_lookups_do_not_need_pinocchio() -> None:
-    code = (
-        "import robots.g1.nominal_pose, sys; sys.exit('pinocchio' in sys.modules or 'mujoco' in sys.modules)"
-    )
+    code = "import robots.g1.nominal_pose, sys; sys.exit('pinocchio' in sys.modules or 'mujoco' in sys.modules)"
     root = Path(__file__).parents[3]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0

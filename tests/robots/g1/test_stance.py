@@ -19,9 +19,7 @@ def test_jacobian_equals_finite_differences(solver: StanceSolver) -> None:
     rng = np.random.default_rng(0)
     for _ in range(10):
         posture = rng.uniform([0.3, -0.4, -0.3, -1.5], [0.76, 0.4, 1.5, 1.5])
-        unknowns = np.concatenate(
-            [rng.uniform(-0.3, 0.3, 4), rng.uniform(solver.lower_limit, solver.upper_limit)]
-        )
+        unknowns = np.concatenate([rng.uniform(-0.3, 0.3, 4), rng.uniform(solver.lower_limit, solver.upper_limit)])
         _, jacobian = solver._residual(posture, unknowns)
         step = 1e-6
         numeric = np.column_stack(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import torch
@@ -110,7 +111,7 @@ def test_the_potential_grows_along_the_way_to_the_sum_of_the_weights() -> None:
     for situation in (_FAR, _NEAR, _REACHED, _SQUEEZED, _LIFTED, _UPRIGHT):
         _run(progress, situation, 0.3)
         values.append(_value(situation, progress))
-    assert all(after > before + 0.1 for before, after in zip(values, values[1:], strict=False)), values
+    assert all(after > before + 0.1 for before, after in itertools.pairwise(values)), values
     assert abs(values[-1] - 12.5) < 1e-5
 
 
