@@ -20,7 +20,7 @@ class Stage:
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("velocity", "linear_velocity", 0.70),
+    Stage("velocity", "linear_velocity", 0.45),
     Stage("height", "base_height", 0.65),
     Stage("torso", "torso_orientation", 0.60),
     Stage("arms", "upper_body_position", 0.30),

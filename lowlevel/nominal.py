@@ -52,8 +52,8 @@ class NominalConfig:
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
     lateral_shift: float = 0.05
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
-    stride: float = 0.22
-    """Hip swing per commanded velocity [rad per m/s, rad per rad/s]."""
+    stride: tuple[float, float, float] = (0.22, 0.22, 0.11)
+    """Hip swing per commanded vx, vy [rad per m/s] and yaw rate [rad per rad/s]."""
     balance_stiffness: float = 2.5
     """Ankle correction per tilt of the pelvis off its nominal attitude [rad/rad]; 0 switches the strategy off."""
     balance_damping: float = 0.2
@@ -103,6 +103,7 @@ class NominalMotion:
         self._inverse_stiffness = 1.0 / stiffness
         rate = torch.full((COMMAND_SIZE,), math.inf, device=device)
         rate[HEIGHT], rate[TORSO], rate[ARMS] = config.height_rate, config.torso_rate, config.arm_rate
+        self._stride = torch.tensor(config.stride, device=device)
         self._largest_change = rate * control_period
 
     def initial_state(self, command: Tensor) -> NominalState:
@@ -167,20 +168,20 @@ class NominalMotion:
     def _add_march(self, targets: Tensor, state: NominalState) -> None:
         config = self.config
         sine, cosine = torch.sin(state.phase), torch.cos(state.phase)
-        vx, vy, yaw_rate = state.reference[:, VELOCITY].unbind(-1)
+        forwards, sideways, turn = (state.reference[:, VELOCITY] * self._stride).unbind(-1)
         for side, sign in (("left", 1.0), ("right", -1.0)):
             lift = config.knee_lift * (sign * sine).clamp_min(0.0) * state.walking
             # The swing foot travels from behind to ahead of the hip: its offset goes with -cos(phase).
-            swing = -sign * cosine * config.stride * state.walking
-            pitch = -swing * vx - 0.5 * lift
+            swing = -sign * cosine * state.walking
+            pitch = -swing * forwards - 0.5 * lift
             roll = config.lateral_shift * sine * state.walking
             offsets = {
                 "hip_pitch": pitch,
-                "hip_roll": roll + swing * vy,
-                "hip_yaw": swing * yaw_rate,
+                "hip_roll": roll + swing * sideways,
+                "hip_yaw": swing * turn,
                 "knee": lift,
                 "ankle_pitch": -pitch - lift,
-                "ankle_roll": -roll - swing * vy,
+                "ankle_roll": -roll - swing * sideways,
             }
             for joint, offset in offsets.items():
                 targets[:, joint_index(f"{side}_{joint}_joint")] += offset

@@ -58,8 +58,11 @@ class Transition:
 
 
 def linear_velocity(t: Transition) -> Tensor:
-    """Kernel on the horizontal velocity error, standard deviation 0.5 m/s."""
-    return torch.exp(-velocity_error(t.measured, t.command)[:, :2].square().sum(-1) / 0.25)
+    """Laplace kernel on the horizontal velocity error, scale 0.3 m/s.
+
+    A Gaussian of standard deviation 0.5 m/s pays 0.7 to a robot that marches in place when told to walk at 0.3 m/s.
+    """
+    return torch.exp(-velocity_error(t.measured, t.command)[:, :2].norm(dim=-1) / 0.3)
 
 
 def angular_velocity(t: Transition) -> Tensor:
