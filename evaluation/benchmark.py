@@ -12,22 +12,15 @@ import os
 import platform
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import onnxruntime
 import torch
 import tyro
 from rich.progress import Progress
-from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from evaluation.baseline import PlainMujocoEnv
 from evaluation.reports import (
     METRICS_FILE,
     REPORT_FILE,
@@ -40,21 +33,20 @@ from evaluation.reports import (
     write_metrics,
     write_results,
 )
-from evaluation.statistics import Figure, mean_figure, quantile_figure
-from highlevel.environment import CommandEnvironment, PhysicsConfig
-from highlevel.gym_env import PlannerEnv
+from evaluation.speed import (
+    WINDOWS,
+    measure_environment,
+    measure_latency,
+    measure_training,
+    plain_rates,
+    planner_rates,
+    single_planner_rates,
+)
+from evaluation.statistics import Figure, mean_figure
 from highlevel.task import load_task
-from highlevel.vec_env import PlannerVecEnv
-from lowlevel.controller import ONNX_FILE, Controller, Proprioception, content_hash
-from lowlevel.environment import PilotEnvironment
+from lowlevel.controller import ONNX_FILE, Controller, content_hash
 from lowlevel.export import freeze
 from lowlevel.presets import PRESETS
-from lowlevel.terrain import MAP_SIZE
-from lowlevel.trainer import Trainer, TrainingConfig
-from robots.g1.constants import NUM_JOINTS
-
-WINDOWS = 5
-"""Measurements per rate; their spread gives the interval."""
 
 
 @dataclass(frozen=True)
@@ -133,10 +125,12 @@ def measure_everything(
     controller = Controller.load(folder / "controller")
     figures |= measure_latency(controller, folder / "controller" / ONNX_FILE, arguments.ticks)
     next_is("planner")
-    rates = planner_rates(controller, arguments)
+    rates = planner_rates(
+        arguments.task, controller, arguments.planner_robots, arguments.cores, arguments.seconds
+    )
     figures["planner_decisions_per_second"] = mean_figure(rates, "1/s")
     next_is("single planners")
-    rates = single_planner_rates(folder / "controller", arguments)
+    rates = single_planner_rates(arguments.task, folder / "controller", arguments.cores, arguments.seconds)
     figures["planner_subproc_decisions_per_second"] = mean_figure(rates, "1/s")
     progress.update(task, advance=1)
     for ratio, (ours, baseline) in RATIOS.items():
@@ -148,183 +142,6 @@ RATIOS: dict[str, tuple[str, str]] = {
     "environment_over_plain_subproc": ("environment_steps_per_second", "plain_subproc_steps_per_second"),
     "planner_over_subproc": ("planner_decisions_per_second", "planner_subproc_decisions_per_second"),
 }
-
-
-def window_rates(step: Callable[[], int], seconds: float, windows: int = WINDOWS) -> list[float]:
-    """Units of work per second in each window, after one warm-up; ``step`` returns its units."""
-    step()
-    rates = []
-    for _ in range(windows):
-        began, done = time.perf_counter(), 0
-        while (elapsed := time.perf_counter() - began) < seconds / windows or not done:
-            done += step()
-        rates.append(done / elapsed)
-    return rates
-
-
-# -- low level -----------------------------------------------------------------------------------------------
-
-
-def measure_training(config: TrainingConfig, folder: Path, updates: int) -> tuple[dict[str, Figure], Trainer]:
-    """End-to-end training with the full network, and the trainer."""
-    trainer = Trainer(config, folder)
-    trainer.observation = trainer.environment.reset(spread_episodes=True)
-    trainer.iterate()
-    rates, shares = [], []
-    for _ in range(updates):
-        began, before = time.perf_counter(), trainer.steps
-        collected = trainer.iterate()["speed/collection_seconds"]
-        elapsed = time.perf_counter() - began
-        rates.append((trainer.steps - before) / elapsed)
-        shares.append(1.0 - collected / elapsed)
-    return {
-        "training_steps_per_second": mean_figure(rates, "1/s"),
-        "training_update_share": mean_figure(shares, "1"),
-    }, trainer
-
-
-class _TimedSimulation:
-    """A simulation that adds up the time spent in physics."""
-
-    def __init__(self, simulation: Any) -> None:
-        self._simulation = simulation
-        self.seconds = 0.0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._simulation, name)
-
-    def step(self, targets: torch.Tensor) -> None:
-        began = time.perf_counter()
-        self._simulation.step(targets)
-        self.seconds += time.perf_counter() - began
-
-
-def measure_environment(environment: PilotEnvironment, seconds: float) -> dict[str, Figure]:
-    """The environment with zero actions, and physics alone as seen from within it."""
-    count = environment.num_robots
-    action = torch.zeros(count, NUM_JOINTS)
-    simulation = environment.simulation
-    timed = _TimedSimulation(simulation)
-    environment.simulation = timed  # type: ignore[assignment]
-
-    def step() -> int:
-        environment.step(action)
-        return count
-
-    environment_rates, physics_rates, shares = [], [], []
-    try:
-        for _ in range(WINDOWS):
-            step()
-            timed.seconds, done, began = 0.0, 0, time.perf_counter()
-            while (elapsed := time.perf_counter() - began) < seconds / WINDOWS or not done:
-                done += step()
-            environment_rates.append(done / elapsed)
-            physics_rates.append(done / timed.seconds)
-            shares.append(1.0 - timed.seconds / elapsed)
-    finally:
-        environment.simulation = simulation
-    return {
-        "physics_steps_per_second": mean_figure(physics_rates, "1/s"),
-        "environment_steps_per_second": mean_figure(environment_rates, "1/s"),
-        "environment_python_share": mean_figure(shares, "1"),
-    }
-
-
-def plain_rates(config: TrainingConfig, processes: int, seconds: float) -> list[float]:
-    """Control steps per second of one plain environment per process."""
-    environment = config.environment
-    make = partial(PlainMujocoEnv, environment.gains, environment.timestep, environment.decimation)
-    return _subproc_rates([make] * processes, seconds)
-
-
-def _subproc_rates(makers: list[Callable[[], Any]], seconds: float) -> list[float]:
-    environments = SubprocVecEnv(makers)
-    try:
-        environments.reset()
-        action = np.zeros((len(makers), *environments.action_space.shape), dtype=np.float32)  # type: ignore[misc]
-
-        def step() -> int:
-            environments.step(action)
-            return len(makers)
-
-        return window_rates(step, seconds)
-    finally:
-        environments.close()
-
-
-def measure_latency(controller: Controller, onnx: Path, ticks: int) -> dict[str, Figure]:
-    """One robot on one core: a whole control step in torch, and the policy network alone in both runtimes."""
-    space = controller.config.command_space
-    state = Proprioception(
-        torch.tensor(controller.config.default_position)[None],
-        torch.zeros(1, NUM_JOINTS),
-        torch.zeros(1, 3),
-        torch.tensor([[0.0, 0.0, -1.0]]),
-    )
-    elevation, command, flag = torch.full((1, MAP_SIZE), 0.76), space.neutral()[None], torch.ones(1, 1)
-    controller.reset(1)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(onnx), options, providers=["CPUExecutionProvider"])
-    history = torch.randn(1, controller.actor.sizes.history, generator=torch.Generator().manual_seed(0))
-    inputs = {"history": history.numpy(), "elevation_map": elevation.numpy(), "flag": flag.numpy()}
-    wanted = {value.name for value in session.get_inputs()}
-    inputs = {name: value for name, value in inputs.items() if name in wanted}
-
-    def network() -> None:
-        with torch.no_grad():
-            controller.actor(history, elevation, flag)
-
-    measured = {
-        "controller_tick": lambda: controller.act(state, elevation, command, flag),
-        "network_torch": network,
-        "network_onnx": lambda: session.run(["action"], inputs),
-    }
-    figures = {}
-    for name, call in measured.items():
-        for _ in range(20):
-            call()
-        latencies = []
-        for _ in range(ticks):
-            began = time.perf_counter()
-            call()
-            latencies.append(1e3 * (time.perf_counter() - began))
-        figures[f"{name}_p50"] = quantile_figure(latencies, 0.50, "ms")
-        figures[f"{name}_p99"] = quantile_figure(latencies, 0.99, "ms")
-    return figures
-
-
-# -- high level ----------------------------------------------------------------------------------------------
-
-
-def planner_rates(controller: Controller, arguments: Arguments) -> list[float]:
-    """Decisions per second of the batched environment."""
-    physics = PhysicsConfig(num_threads=arguments.cores)
-    environment = CommandEnvironment(
-        load_task(arguments.task), controller, arguments.planner_robots, physics=physics
-    )
-    batched = PlannerVecEnv(environment)
-    batched.seed(0)
-    batched.reset()
-    action = np.zeros((arguments.planner_robots, *batched.action_space.shape), dtype=np.float32)  # type: ignore[misc]
-
-    def step() -> int:
-        batched.step(action)
-        return arguments.planner_robots
-
-    return window_rates(step, arguments.seconds)
-
-
-def single_planner(task: str, controller: Path) -> PlannerEnv:
-    """One robot on one thread, for a process of its own."""
-    torch.set_num_threads(1)
-    return PlannerEnv(task, controller)
-
-
-def single_planner_rates(controller: Path, arguments: Arguments) -> list[float]:
-    """Decisions per second of one single environment per process."""
-    make = partial(single_planner, arguments.task, controller)
-    return _subproc_rates([make] * arguments.cores, arguments.seconds)
 
 
 # -- report --------------------------------------------------------------------------------------------------

@@ -21,8 +21,8 @@ class Stage:
 
 STAGES: tuple[Stage, ...] = (
     Stage("velocity", "linear_velocity", 0.45),
-    Stage("height", "base_height", 0.65),
-    Stage("torso", "torso_orientation", 0.60),
+    Stage("height", "base_height", 0.60),
+    Stage("torso", "torso_orientation", 0.45),
     Stage("arms", "upper_body_position", 0.30),
 )
 """In the paper's order: locomotion, then height, then torso attitude, then arms."""

@@ -29,6 +29,10 @@ from robots.g1.constants import (
 from robots.g1.nominal_pose import NominalPose
 
 
+_WAIST_AGAINST_LEAN = ("waist_pitch_joint", "waist_roll_joint")
+"""Waist joints that undo a lean along x (forwards) and along y (to the left)."""
+
+
 @dataclass(frozen=True)
 class NominalConfig:
     """Nominal motion that the policy's action corrects."""
@@ -63,7 +67,7 @@ class NominalConfig:
     rights the body."""
     step_damping: float = 0.27
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
-    lean: tuple[float, float] = (0.1, 0.25)
+    lean: tuple[float, float] = (0.18, 0.5)
     """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
     chase it carry the robot along."""
 
@@ -204,7 +208,10 @@ class NominalMotion:
         down[:, 2] = -1.0
         wanted = rotate_inverse(attitude, down)
         for axis, lean in enumerate(config.lean):
-            wanted[:, axis] += lean * state.reference[:, axis] * state.walking
+            angle = lean * state.reference[:, axis] * state.walking
+            wanted[:, axis] += angle
+            # The waist takes the lean back, so that the torso keeps its commanded attitude.
+            targets[:, joint_index(_WAIST_AGAINST_LEAN[axis])] += (-angle, angle)[axis]
         tilt = torch.linalg.cross(gravity, wanted)
         ankle = config.balance_stiffness * tilt + config.balance_damping * angular_velocity
         capture = config.step_stiffness * tilt + config.step_damping * angular_velocity

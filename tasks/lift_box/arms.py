@@ -151,22 +151,23 @@ class ArmKinematics:
         return joints, (self.forward(waist, joints).position - position).norm(dim=-1)
 
 
-def palm_rotation(forward: Tensor, finger_pitch: float, toe_in: float = 0.0) -> Tensor:
-    """Axes (N, 2, 3, 3) of palms that face each other, with the fingers along ``forward`` (N, 3), pitched
-    down.
+def palm_rotation(forward: Tensor, finger_pitch: Tensor, toe_in: Tensor) -> Tensor:
+    """Axes (N, 2, 3, 3) of palms that face each other, with the fingers along ``forward`` (N, 3).
 
-    ``forward`` is a horizontal unit vector; ``finger_pitch`` [rad] turns the fingers down, and ``toe_in``
-    [rad] turns each hand about its thumb axis so that the fingers point at each other.
+    ``forward`` is a horizontal unit vector; ``finger_pitch`` (N,) [rad] turns the fingers down, and ``toe_in``
+    (N,) [rad] turns each hand about its thumb axis so that the fingers point at each other.
     """
     up = torch.zeros_like(forward)
     up[:, 2] = 1.0
     left = torch.linalg.cross(up, forward)
-    world = torch.stack([forward, left, up], dim=-1)
-    turns = [
-        pin.rpy.rpyToMatrix(0.0, finger_pitch, 0.0) @ pin.rpy.rpyToMatrix(0.0, 0.0, s * toe_in)
-        for s in (-1.0, 1.0)
+    cosine, sine = torch.cos(finger_pitch)[:, None], torch.sin(finger_pitch)[:, None]
+    fingers, thumb = cosine * forward - sine * up, sine * forward + cosine * up
+    cosine, sine = torch.cos(toe_in)[:, None], torch.sin(toe_in)[:, None]
+    hands = [
+        torch.stack([cosine * fingers + side * sine * left, cosine * left - side * sine * fingers, thumb], dim=-1)
+        for side in (-1.0, 1.0)
     ]
-    return world[:, None] @ torch.tensor(np.array(turns), dtype=torch.float32)
+    return torch.stack(hands, dim=1)
 
 
 def quaternion_of(rotation: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ generator and DemoHLM's three segments (walk, reach in the object's frame, lift 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -61,6 +61,12 @@ class ExpertConfig:
     """Fingers point down by this much [rad]."""
     toe_in: float = 0.12
     """Fingers point at each other by this much, so that forearms stay clear of the faces [rad]."""
+    toe_in_per_depth: float = 2.5
+    """More of it per squeeze depth [rad/m]: the wrists give way, and the palms must not open."""
+    level_gain: float = 0.1
+    """Share of the box's pitch that the fingers take back at every decision while it is carried."""
+    largest_level: float = 0.6
+    """[rad]"""
     wide: float = 0.06
     """Extra clearance of each palm while the body descends [m]."""
     reach_length: float = 0.42
@@ -79,7 +85,7 @@ class ExpertConfig:
     """Time with both palms loaded before the lift [s]."""
     lift_time: float = 2.6
     """[s]"""
-    carry_ahead: float = 0.33
+    carry_ahead: float = 0.37
     """Of the palms from the feet when upright [m]."""
     carry_height: float = 0.74
     """Least height of the palms when upright [m]."""
@@ -110,6 +116,8 @@ class _Memory:
     """Middle between the palms when the lift began (N, 3) [m], world frame."""
     grasp_yaw: Tensor
     """Yaw of the box when the lift began (N,) [rad]."""
+    level: Tensor
+    """Added to the pitch of the fingers to level the box (N,) [rad]."""
     loaded_time: Tensor
     """(N,) [s]"""
     arms: Tensor
@@ -142,6 +150,7 @@ class LiftBoxExpert:
             correction=torch.zeros(count, 2, 3),
             grasp_point=torch.zeros(count, 3),
             grasp_yaw=torch.zeros(count),
+            level=torch.zeros(count),
             loaded_time=torch.zeros(count),
             arms=torch.zeros(count, 14),
         )
@@ -155,8 +164,8 @@ class LiftBoxExpert:
     def reset(self, ids: Tensor) -> None:
         """Begin new episodes in rows ``ids``."""
         memory = self._memory
-        for values in (memory.phase, memory.time, memory.descent, memory.correction, memory.loaded_time):
-            values[ids] = 0
+        for item in fields(memory):
+            getattr(memory, item.name)[ids] = 0
         memory.depth[ids] = -self.config.clearance
         memory.arms[ids] = self._neutral[ARMS]
 
@@ -312,7 +321,9 @@ class LiftBoxExpert:
 
         pelvis_frame = robot.base_quaternion[:, None].expand(-1, 2, -1)
         position = rotate_inverse(pelvis_frame, target + memory.correction - robot.base_position[:, None])
-        axes = palm_rotation(forward, config.finger_pitch, config.toe_in)
+        self._level_box(situation, forward)
+        toe_in = config.toe_in + config.toe_in_per_depth * memory.depth.clamp_min(0.0)
+        axes = palm_rotation(forward, config.finger_pitch + memory.level, toe_in)
         columns = axes.transpose(-1, -2)
         in_pelvis = rotate_inverse(robot.base_quaternion[:, None, None].expand(-1, 2, 3, -1), columns)
         rest = self._rest_posture(situation.torso_pitch)
@@ -357,6 +368,17 @@ class LiftBoxExpert:
         limit = config.largest_correction
         change = config.correction_gain * error * active[:, None, None]
         memory.correction = (memory.correction + change).clamp(-limit, limit)
+
+
+    def _level_box(self, situation: Situation, forward: Tensor) -> None:
+        """Turn the fingers against the pitch of a box that is carried; it swings between the palms."""
+        config, memory = self.config, self._memory
+        up = torch.zeros_like(forward)
+        up[:, 2] = 1.0
+        upright = rotate(situation.box_pose[:, 3:], up)
+        pitch = torch.atan2((upright * forward).sum(-1), upright[:, 2])
+        change = config.level_gain * pitch * (memory.phase >= LIFT)
+        memory.level = (memory.level - change).clamp(-config.largest_level, config.largest_level)
 
 
 def _smooth(share: Tensor) -> Tensor:

@@ -9,7 +9,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from evaluation.baseline import PlainMujocoEnv
-from evaluation.benchmark import main, measure_environment, measure_latency, window_rates
+from evaluation.benchmark import main
+from evaluation.speed import measure_environment, measure_latency, window_rates
 from lowlevel.controller import ONNX_FILE, Controller
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 

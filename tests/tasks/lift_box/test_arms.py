@@ -92,7 +92,7 @@ def test_quaternions_of_matrices_equal_pinocchios_at_every_branch() -> None:
 
 
 def test_palms_face_each_other_with_fingers_down_and_inwards() -> None:
-    rotation = palm_rotation(torch.tensor([[0.0, 1.0, 0.0]]), finger_pitch=0.5, toe_in=0.2)[0]
+    rotation = palm_rotation(torch.tensor([[0.0, 1.0, 0.0]]), torch.tensor([0.5]), torch.tensor([0.2]))[0]
     left, right = rotation[0], rotation[1]
     torch.testing.assert_close(rotation @ rotation.transpose(-1, -2), torch.eye(3).expand(2, 3, 3))
     # Facing world y, the robot's left is -x: the left hand's fingers point to +x, the right hand's to -x.
