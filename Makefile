@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PLANNER ?= checkpoints/lift_box/planner
+PLANNER ?= scripted
 OUTPUT ?= reports/demo
 
 .PHONY: setup demo test format clean

@@ -164,7 +164,9 @@ def palm_rotation(forward: Tensor, finger_pitch: Tensor, toe_in: Tensor) -> Tens
     fingers, thumb = cosine * forward - sine * up, sine * forward + cosine * up
     cosine, sine = torch.cos(toe_in)[:, None], torch.sin(toe_in)[:, None]
     hands = [
-        torch.stack([cosine * fingers + side * sine * left, cosine * left - side * sine * fingers, thumb], dim=-1)
+        torch.stack(
+            [cosine * fingers + side * sine * left, cosine * left - side * sine * fingers, thumb], dim=-1
+        )
         for side in (-1.0, 1.0)
     ]
     return torch.stack(hands, dim=1)

@@ -16,7 +16,15 @@ from highlevel.environment import CommandEnvironment
 from highlevel.task import rows
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.measures import Measurement
-from lowlevel.rotations import rotate, rotate_about_vertical, rotate_inverse, yaw_of
+from lowlevel.rotations import (
+    conjugate,
+    from_roll_pitch_yaw,
+    multiply,
+    rotate,
+    rotate_about_vertical,
+    rotate_inverse,
+    yaw_of,
+)
 from robots.g1.constants import ARM_JOINTS, WAIST_JOINTS
 from tasks.lift_box.arms import ArmKinematics, palm_rotation
 from tasks.lift_box.geometry import Situation
@@ -93,6 +101,8 @@ class ExpertConfig:
     """Least bottom of the box above its support when upright [m]."""
     stand_height: float = 0.75
     """[m]"""
+    pitch_filter: float = 0.2
+    """Share of the torso's pitch error that the arms take in at every decision while they carry."""
     correction_gain: float = 0.25
     """Share of the palms' position error that is added to the correction at every decision."""
     largest_correction: float = 0.08
@@ -116,6 +126,8 @@ class _Memory:
     """Middle between the palms when the lift began (N, 3) [m], world frame."""
     grasp_yaw: Tensor
     """Yaw of the box when the lift began (N,) [rad]."""
+    pitch_error: Tensor
+    """Torso pitch measured - commanded, filtered (N,) [rad]."""
     level: Tensor
     """Added to the pitch of the fingers to level the box (N,) [rad]."""
     loaded_time: Tensor
@@ -150,6 +162,7 @@ class LiftBoxExpert:
             correction=torch.zeros(count, 2, 3),
             grasp_point=torch.zeros(count, 3),
             grasp_yaw=torch.zeros(count),
+            pitch_error=torch.zeros(count),
             level=torch.zeros(count),
             loaded_time=torch.zeros(count),
             arms=torch.zeros(count, 14),
@@ -319,13 +332,14 @@ class LiftBoxExpert:
         )
         self._correct(error)
 
-        pelvis_frame = robot.base_quaternion[:, None].expand(-1, 2, -1)
+        pelvis = self._pelvis_attitude(measured, situation)
+        pelvis_frame = pelvis[:, None].expand(-1, 2, -1)
         position = rotate_inverse(pelvis_frame, target + memory.correction - robot.base_position[:, None])
         self._level_box(situation, forward)
         toe_in = config.toe_in + config.toe_in_per_depth * memory.depth.clamp_min(0.0)
         axes = palm_rotation(forward, config.finger_pitch + memory.level, toe_in)
         columns = axes.transpose(-1, -2)
-        in_pelvis = rotate_inverse(robot.base_quaternion[:, None, None].expand(-1, 2, 3, -1), columns)
+        in_pelvis = rotate_inverse(pelvis[:, None, None].expand(-1, 2, 3, -1), columns)
         rest = self._rest_posture(situation.torso_pitch)
         waist = robot.joint_position[:, WAIST_JOINTS]
         solution, _ = self._arms.inverse(waist, memory.arms, rest, position, in_pelvis.transpose(-1, -2))
@@ -333,6 +347,25 @@ class LiftBoxExpert:
         ready = self._neutral[ARMS].expand_as(solution)
         memory.arms = torch.where(at_work[:, None], solution, self._rest_posture(situation.torso_pitch))
         return torch.where(at_work[:, None], solution, ready)
+
+    def _pelvis_attitude(self, measured: Measurement, situation: Situation) -> Tensor:
+        """Attitude of the pelvis (N, 4) that the arms reckon with.
+
+        Before the grasp it is the measured one. With a box in the hands the arms must not follow every swing of
+        the torso, which would swing it further: they reckon with the commanded torso pitch and its slowly
+        filtered error.
+        """
+        memory, robot = self._memory, measured.robot
+        pitch = self._posture()[1]
+        lifting = memory.phase >= LIFT
+        error = situation.torso_pitch - pitch
+        gain = torch.where(lifting, self.config.pitch_filter, 1.0)
+        memory.pitch_error = memory.pitch_error + gain * (error - memory.pitch_error)
+        zero = torch.zeros_like(pitch)
+        torso = from_roll_pitch_yaw(torch.stack([zero, pitch + memory.pitch_error, measured.heading], -1))
+        # The pelvis that carries the torso like this, with the waist joints as they are.
+        waist = multiply(conjugate(robot.base_quaternion), robot.torso_quaternion)
+        return torch.where(lifting[:, None], multiply(torso, conjugate(waist)), robot.base_quaternion)
 
     def _rest_posture(self, torso_pitch: Tensor) -> Tensor:
         """Arms hanging ahead of the torso (N, 14), hands half open to the box."""
@@ -368,7 +401,6 @@ class LiftBoxExpert:
         limit = config.largest_correction
         change = config.correction_gain * error * active[:, None, None]
         memory.correction = (memory.correction + change).clamp(-limit, limit)
-
 
     def _level_box(self, situation: Situation, forward: Tensor) -> None:
         """Turn the fingers against the pitch of a box that is carried; it swings between the palms."""
