@@ -99,9 +99,7 @@ def _run(arguments: Arguments) -> None:
     print(f"report: {arguments.output / REPORT_FILE}   figures: {arguments.output / METRICS_FILE}")
 
 
-def measure_everything(
-    arguments: Arguments, folder: Path, progress: Progress
-) -> tuple[dict[str, Figure], str]:
+def measure_everything(arguments: Arguments, folder: Path, progress: Progress) -> tuple[dict[str, Figure], str]:
     """All figures, and the content hash of the controller, of random weights, that they belong to."""
     task = progress.add_task("training", total=6)
 
@@ -125,9 +123,7 @@ def measure_everything(
     controller = Controller.load(folder / "controller")
     figures |= measure_latency(controller, folder / "controller" / ONNX_FILE, arguments.ticks)
     next_is("planner")
-    rates = planner_rates(
-        arguments.task, controller, arguments.planner_robots, arguments.cores, arguments.seconds
-    )
+    rates = planner_rates(arguments.task, controller, arguments.planner_robots, arguments.cores, arguments.seconds)
     figures["planner_decisions_per_second"] = mean_figure(rates, "1/s")
     next_is("single planners")
     rates = single_planner_rates(arguments.task, folder / "controller", arguments.cores, arguments.seconds)

@@ -199,9 +199,7 @@ def _draw(twin: VisualTwin, story: Story, output: Path) -> list[str]:
                 twin.data.qpos[:] = position
                 mujoco.mj_forward(twin.model, twin.data)
                 names.append(f"{number}_{instant}.png")
-                save_picture(
-                    output / names[-1], painter.draw(twin.data, following_camera(twin.model, twin.data))
-                )
+                save_picture(output / names[-1], painter.draw(twin.data, following_camera(twin.model, twin.data)))
     except NoOpenGLError as error:
         print(error)
     return names
@@ -223,9 +221,7 @@ def outcome_text(story: Story) -> str:
     """The outcome in one line."""
     if story.success:
         return f"success after {story.duration:.1f} s"
-    last = (
-        f"after the stage {list(story.stage_times)[-1]!r}" if story.stage_times else "before the first stage"
-    )
+    last = f"after the stage {list(story.stage_times)[-1]!r}" if story.stage_times else "before the first stage"
     return f"failure ({story.failure}) after {story.duration:.1f} s, {last}"
 
 

@@ -202,9 +202,7 @@ def success_figures(records: list[EpisodeRecord], stages: tuple[str, ...]) -> di
 def failure_figures(records: list[EpisodeRecord]) -> dict[str, Figure]:
     """Share of episodes that ended in each kind of failure, the most frequent first."""
     names = Counter(record.failure for record in records if record.failure is not None)
-    return {
-        name: share_figure([record.failure == name for record in records]) for name, _ in names.most_common()
-    }
+    return {name: share_figure([record.failure == name for record in records]) for name, _ in names.most_common()}
 
 
 def all_figures(evaluation: Evaluation) -> dict[str, Figure]:
@@ -314,11 +312,7 @@ def _control_table(evaluation: Evaluation, figures: dict[str, Figure]) -> str:
     rows = []
     for control, records in evaluation.controls.items():
         succeeded = sum(record.success for record in records)
-        verdict = (
-            "as it must be"
-            if succeeded == 0
-            else f"**{succeeded} succeeded: the success criterion is wrong**"
-        )
+        verdict = "as it must be" if succeeded == 0 else f"**{succeeded} succeeded: the success criterion is wrong**"
         full = figures[f"full_{control}"]
         rows.append([control.replace("_", " "), str(len(records)), format_figure(full), verdict])
     return markdown_table(["control", "episodes", "full success", "verdict"], rows)

@@ -209,9 +209,7 @@ def write_report(folder: Path, evaluation: Evaluation) -> None:
         "time since the command changed [s]",
     )
     experts = [f"expert {number}" for number in range(1, evaluation.activations.shape[1] + 1)]
-    plot_heat_map(
-        folder / "experts.png", evaluation.activations, evaluation.modes, experts, "mean expert activation"
-    )
+    plot_heat_map(folder / "experts.png", evaluation.activations, evaluation.modes, experts, "mean expert activation")
     (folder / REPORT_FILE).write_text(report_text(evaluation))
     activations = {
         mode: [None if np.isnan(value) else float(value) for value in row]
@@ -233,8 +231,7 @@ def write_report(folder: Path, evaluation: Evaluation) -> None:
 def summary(evaluation: Evaluation) -> str:
     """The headline figures in one line."""
     values = [
-        f"{name} {format_figure(evaluation.figures[name]).split(' ')[0]}"
-        for name in (*TRACKING_FIGURES, "fall_rate")
+        f"{name} {format_figure(evaluation.figures[name]).split(' ')[0]}" for name in (*TRACKING_FIGURES, "fall_rate")
     ]
     return "  ".join(values)
 
@@ -254,9 +251,7 @@ def report_text(evaluation: Evaluation) -> str:
             f"(Wilson intervals for shares). Steady figures leave out the first {TRANSIENT:.0f} s after a "
             "change of command. A fallen episode counts in full at the error it had until its fall.",
             "",
-            markdown_table(
-                ["figure", "unit", "ours", "ours, steady", "paper"], _main_rows(figures, evaluation.suite)
-            ),
+            markdown_table(["figure", "unit", "ours", "ours, steady", "paper"], _main_rows(figures, evaluation.suite)),
             "![tracking](tracking.png)",
             "",
             "## By kind of command",
@@ -282,8 +277,7 @@ def report_text(evaluation: Evaluation) -> str:
             "",
             "## Experts",
             "",
-            "Mean activation of each expert in six motion modes, after the transient; blank where no robot "
-            "stayed up.",
+            "Mean activation of each expert in six motion modes, after the transient; blank where no robot stayed up.",
             "",
             "![experts](experts.png)",
             "",

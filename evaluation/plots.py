@@ -64,9 +64,7 @@ def plot_curves(
     _save(canvas, path)
 
 
-def plot_heat_map(
-    path: Path, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str
-) -> None:
+def plot_heat_map(path: Path, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
     """``values`` (rows, columns) with their numbers written in; NaN stays blank."""
     canvas, axis = pyplot.subplots(figsize=(1.6 + 1.1 * len(columns), 1.4 + 0.5 * len(rows)))
     image = axis.imshow(values, cmap="coolwarm", aspect="auto")

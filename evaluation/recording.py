@@ -48,11 +48,7 @@ class Recorder:
     """
 
     def __init__(self, path: Path | None, live: bool = False) -> None:
-        if (
-            live
-            and sys.platform.startswith("linux")
-            and not ({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))
-        ):
+        if live and sys.platform.startswith("linux") and not ({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)):
             raise ValueError("a live view needs a display: leave out --live and open the recording")
         self._path = path
         self._partial = None if path is None else path.with_name(f".{path.name}.partial")
@@ -112,9 +108,7 @@ class Recorder:
         for body in range(1, model.nbody):
             if model.body_weldid[body] != 0:
                 w, x, y, z = data.xquat[body]
-                pose = rr.Transform3D(
-                    translation=data.xpos[body], quaternion=rr.Quaternion(xyzw=[x, y, z, w])
-                )
+                pose = rr.Transform3D(translation=data.xpos[body], quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
                 self.stream.log(_entity(model, body), pose)
 
     def name_series(self, path: str, names: list[str]) -> None:

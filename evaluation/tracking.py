@@ -131,9 +131,7 @@ def run_tracking(
             )
             errors = torch.where(moment.active[:, None], errors, 0.0)
             group = group_of(moment.command, moment.flag)
-            members = torch.stack(
-                [moment.active, *(moment.active & (group == g) for g in range(len(GROUPS)))]
-            )
+            members = torch.stack([moment.active, *(moment.active & (group == g) for g in range(len(GROUPS)))])
             is_steady = moment.since_change > TRANSIENT
             masks = torch.cat([members, members & is_steady])
             weights = masks.numpy()[:, : len(batch)]

@@ -61,9 +61,7 @@ class ActionMap:
         control_period: of the controller [s].
     """
 
-    def __init__(
-        self, config: ActionConfig, control_period: float, device: torch.device | str = "cpu"
-    ) -> None:
+    def __init__(self, config: ActionConfig, control_period: float, device: torch.device | str = "cpu") -> None:
         self.config = config
         arm_sign = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
         center, half = torch.tensor(config.arm_center), torch.tensor(config.arm_half_range)
@@ -78,9 +76,7 @@ class ActionMap:
             config.velocity_upper, config.height[1], torso_upper, (arm_center + arm_half).tolist(), device
         )
         torso_rate = (config.roll_yaw_rate, config.pitch_rate, config.roll_yaw_rate)
-        rate = _assemble(
-            config.velocity_rate, config.height_rate, torso_rate, (config.arm_rate,) * 14, device
-        )
+        rate = _assemble(config.velocity_rate, config.height_rate, torso_rate, (config.arm_rate,) * 14, device)
         self.largest_change = rate * config.decision_steps * control_period
         """Largest change of the command in one decision (21,)."""
 

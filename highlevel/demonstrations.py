@@ -68,9 +68,7 @@ class Demonstrations:
             raise FileNotFoundError(f"{path} does not exist: record demonstrations first")
         try:
             with np.load(path, allow_pickle=False) as file:
-                loaded = cls(
-                    file["observation"], file["action"], file["value"], file["episode"], int(file["attempts"])
-                )
+                loaded = cls(file["observation"], file["action"], file["value"], file["episode"], int(file["attempts"]))
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path} does not hold demonstrations: {error}") from error
         for name in ("observation", "action", "value"):
@@ -131,8 +129,7 @@ def record(
                 on_progress(len(finished), attempts)
             if not finished and attempts > 4 * count + 100:
                 raise RuntimeError(
-                    f"the expert failed {attempts} times in a row: check the controller with "
-                    f"'evaluate-lowlevel'"
+                    f"the expert failed {attempts} times in a row: check the controller with 'evaluate-lowlevel'"
                 )
         observation = result.observation
     return _pack(finished, attempts, discount, environment)
@@ -155,12 +152,8 @@ def _pack(
     width = environment.observation_size
     return Demonstrations(
         observation=np.array([step[0].numpy() for step in steps], np.float32).reshape(-1, width),
-        action=np.array([step[1].numpy() for step in steps], np.float32).reshape(
-            -1, environment.command.shape[1]
-        ),
+        action=np.array([step[1].numpy() for step in steps], np.float32).reshape(-1, environment.command.shape[1]),
         value=np.array(values, np.float32),
-        episode=np.repeat(
-            [number for number, _ in finished], [len(episode) for _, episode in finished]
-        ).astype(int),
+        episode=np.repeat([number for number, _ in finished], [len(episode) for _, episode in finished]).astype(int),
         attempts=attempts,
     )

@@ -151,8 +151,7 @@ class CommandEnvironment:
         decimation = round(config.control_period / physics.timestep)
         if abs(decimation * physics.timestep - config.control_period) > 1e-9:
             raise ValueError(
-                f"the physics step {physics.timestep} s does not divide the control period "
-                f"{config.control_period} s"
+                f"the physics step {physics.timestep} s does not divide the control period {config.control_period} s"
             )
         return BatchSimulation(spec.compile(), num_envs, decimation, physics.num_threads)
 
@@ -235,9 +234,7 @@ class CommandEnvironment:
         elevation = self.terrain.elevation_map(self.measured.robot.base_position, self.measured.heading)
         for number in range(1, steps + 1):
             command = interpolate(previous, goal, number / steps)
-            self.simulation.step(
-                self.controller.act(_proprioception(self.measured), elevation, command, self._flag)
-            )
+            self.simulation.step(self.controller.act(_proprioception(self.measured), elevation, command, self._flag))
             self.measured = measure(self.simulation.read(), self.terrain)
             falls = has_fallen(self.measured, self.controller.reference) | self.simulation.diverged()
             outcome = self.task.step(self.measured, decision)

@@ -157,9 +157,7 @@ def planner_hash(folder: Path | str) -> str:
 def _read_json(folder: Path) -> dict[str, Any]:
     path = folder / PLANNER_FILE
     if not path.is_file():
-        raise PlannerError(
-            f"{path} is missing: give a planner folder, such as one under checkpoints/highlevel"
-        )
+        raise PlannerError(f"{path} is missing: give a planner folder, such as one under checkpoints/highlevel")
     try:
         content = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
@@ -179,7 +177,5 @@ def _read_weights(folder: Path) -> dict[str, Tensor]:
         raise PlannerError(f"{path} is damaged or truncated: {error}") from error
     for name, tensor in tensors.items():
         if not torch.isfinite(tensor).all():
-            raise PlannerError(
-                f"{path} holds numbers in {name!r} that are not finite: train the planner again"
-            )
+            raise PlannerError(f"{path} holds numbers in {name!r} that are not finite: train the planner again")
     return tensors

@@ -43,9 +43,7 @@ def main(arguments: list[str] | None = None) -> None:
     parsed = tyro.cli(Arguments, args=given, default=Arguments(config=PlannerTrainingConfig()))
     try:
         if parsed.resume is not None and len(given) > 2:
-            raise ValueError(
-                "--resume takes the configuration of the run it continues: leave the other options out"
-            )
+            raise ValueError("--resume takes the configuration of the run it continues: leave the other options out")
         run(parsed)
     except (ValueError, FileNotFoundError, FileExistsError, OSError, RuntimeError) as error:
         sys.exit(f"train-highlevel: {error}")
@@ -56,19 +54,13 @@ def run(arguments: Arguments) -> PlannerTrainer:
     trainer = _resumed(arguments.resume) if arguments.resume else _fresh(arguments)
     print(f"training in {trainer.folder}", flush=True)
     trainer.run()
-    rate = (
-        f"success rate {trainer.best_rate:.1%} on the selection episodes"
-        if trainer.best_rate >= 0
-        else "none yet"
-    )
+    rate = f"success rate {trainer.best_rate:.1%} on the selection episodes" if trainer.best_rate >= 0 else "none yet"
     print(f"best planner: {rate}; results lie in {trainer.folder}, the planner in its folder {BEST_FOLDER}")
     return trainer
 
 
 def _fresh(arguments: Arguments) -> PlannerTrainer:
-    folder = arguments.output / (
-        arguments.name or f"{arguments.config.task}-{time.strftime('%Y%m%d-%H%M%S')}"
-    )
+    folder = arguments.output / (arguments.name or f"{arguments.config.task}-{time.strftime('%Y%m%d-%H%M%S')}")
     if (folder / STATE_FILE).exists():
         raise FileExistsError(
             f"{folder} already holds a run: continue it with --resume {folder}, or give another --name"

@@ -309,18 +309,14 @@ class PlannerTrainer:
         if not hasattr(self, "_selection_environment"):
             self._selection_environment = self._build_environment(SELECTION_SEED)
         planner = self.planner()
-        records = run_episodes(
-            self._selection_environment, planner, self.config.selection_episodes, SELECTION_SEED
-        )
+        records = run_episodes(self._selection_environment, planner, self.config.selection_episodes, SELECTION_SEED)
         rate = success_rate(records)
         self.last_selection = self.model.num_timesteps
         if rate > self.best_rate:
             self.best_rate, self.best_decisions = rate, self.model.num_timesteps
             planner.provenance["selection"] = {"success_rate": rate, "episodes": len(records)}
             planner.save(self.folder / BEST_FOLDER)
-        stages = [
-            sum(record.stage > i for record in records) for i in range(len(self.environment.task.stages))
-        ]
+        stages = [sum(record.stage > i for record in records) for i in range(len(self.environment.task.stages))]
         figures = {
             f"selection/{name}": passed / len(records)
             for name, passed in zip(self.environment.task.stages, stages, strict=True)

@@ -95,9 +95,7 @@ class PlannerVecEnv(VecEnv):
             raise ValueError(f"{attr_name!r} is shared by all robots: set it without indices")
         setattr(self.environment, attr_name, value)
 
-    def env_method(
-        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
-    ) -> list[Any]:
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         """Call a method of the shared environment once and hand its result to every robot asked about."""
         result = getattr(self.environment, method_name)(*args, **kwargs)
         return [result for _ in self._get_indices(indices)]

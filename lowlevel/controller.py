@@ -321,7 +321,7 @@ def add_metrics(folder: Path | str, metrics: dict[str, Any]) -> None:
 
 
 def export_onnx(actor: PilotActor, path: Path) -> None:
-    """The policy network as ONNX: (history, elevation_map, flag) to (action, gate, velocity, latent), any batch size."""
+    """The policy network as ONNX: (history, elevation_map, flag) to (action, gate, velocity, latent); any batch."""
     sizes = actor.sizes
     rows = torch.export.Dim("robots")
     inputs = (torch.zeros(2, sizes.history), torch.zeros(2, sizes.elevation_map), torch.zeros(2, 1))

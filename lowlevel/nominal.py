@@ -28,7 +28,6 @@ from robots.g1.constants import (
 )
 from robots.g1.nominal_pose import NominalPose
 
-
 _WAIST_AGAINST_LEAN = ("waist_pitch_joint", "waist_roll_joint")
 """Waist joints that undo a lean along x (forwards) and along y (to the left)."""
 

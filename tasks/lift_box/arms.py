@@ -71,10 +71,7 @@ class ArmKinematics:
             joints = [model.getJointId(name) for name in names]
             parents = [pelvis, *(data.oMi[joint] for joint in joints[:-1])]
             offsets.append(
-                [
-                    parent.actInv(data.oMi[joint]).homogeneous
-                    for parent, joint in zip(parents, joints, strict=True)
-                ]
+                [parent.actInv(data.oMi[joint]).homogeneous for parent, joint in zip(parents, joints, strict=True)]
             )
             axes.append([_axis(model.joints[joint]) for joint in joints])
             palms.append(data.oMi[joints[-1]].actInv(data.oMf[model.getFrameId(palm)]).translation)
@@ -82,9 +79,7 @@ class ArmKinematics:
         self._axes = torch.tensor(np.array(axes), dtype=torch.float32)
         self._skew = _skew(self._axes)
         self._palms = torch.tensor(np.array(palms), dtype=torch.float32)
-        limits = np.stack(
-            [model.lowerPositionLimit[7:][ARM_JOINTS], model.upperPositionLimit[7:][ARM_JOINTS]]
-        )
+        limits = np.stack([model.lowerPositionLimit[7:][ARM_JOINTS], model.upperPositionLimit[7:][ARM_JOINTS]])
         margin = np.array([[self.config.limit_margin], [-self.config.limit_margin]])
         self.lower, self.upper = torch.tensor(limits + margin, dtype=torch.float32)
 
@@ -164,9 +159,7 @@ def palm_rotation(forward: Tensor, finger_pitch: Tensor, toe_in: Tensor) -> Tens
     fingers, thumb = cosine * forward - sine * up, sine * forward + cosine * up
     cosine, sine = torch.cos(toe_in)[:, None], torch.sin(toe_in)[:, None]
     hands = [
-        torch.stack(
-            [cosine * fingers + side * sine * left, cosine * left - side * sine * fingers, thumb], dim=-1
-        )
+        torch.stack([cosine * fingers + side * sine * left, cosine * left - side * sine * fingers, thumb], dim=-1)
         for side in (-1.0, 1.0)
     ]
     return torch.stack(hands, dim=1)

@@ -52,10 +52,12 @@ class ExpertConfig:
     slowest: float = 0.14
     """Least speed while walking [m/s]: the controller ignores slower commands."""
     position_tolerance: float = 0.04
-    """[m]"""
+    """Along the box's x axis [m]."""
+    lateral_tolerance: float = 0.07
+    """Along its y axis, where the arms make up for the rest [m]."""
     yaw_tolerance: float = 0.09
     """[rad]"""
-    loose: float = 2.0
+    loose: float = 1.5
     """Tolerances grow by this factor once it stands, before it walks again."""
     settle_time: float = 0.5
     """Standing time before the descent [s]."""
@@ -71,7 +73,7 @@ class ExpertConfig:
     """Fingers point at each other by this much, so that forearms stay clear of the faces [rad]."""
     toe_in_per_depth: float = 2.5
     """More of it per squeeze depth [rad/m]: the wrists give way, and the palms must not open."""
-    level_gain: float = 0.1
+    level_gain: float = 0.05
     """Share of the box's pitch that the fingers take back at every decision while it is carried."""
     largest_level: float = 0.6
     """[rad]"""
@@ -81,11 +83,11 @@ class ExpertConfig:
     """Largest distance of a palm from its shoulder while the body descends [m]."""
     ready_tolerance: float = 0.06
     """Of the palms from their pre-grasp places before they close [m]."""
-    close_speed: float = 0.12
+    close_speed: float = 0.16
     """Of each palm towards its face [m/s]."""
-    force: float = 25.0
+    force: float = 30.0
     """Wanted normal force per palm [N]."""
-    force_gain: float = 0.0010
+    force_gain: float = 0.0016
     """Squeeze depth per force error and decision [m/N]."""
     deepest: float = 0.08
     """Largest squeeze depth [m]."""
@@ -102,7 +104,9 @@ class ExpertConfig:
     stand_height: float = 0.75
     """[m]"""
     pitch_filter: float = 0.2
-    """Share of the torso's pitch error that the arms take in at every decision while they carry."""
+    """Share of the torso's pitch error that the arms take in at every decision during the lift."""
+    hold_filter: float = 0.05
+    """The same while the box is held."""
     correction_gain: float = 0.25
     """Share of the palms' position error that is added to the correction at every decision."""
     largest_correction: float = 0.08
@@ -145,9 +149,7 @@ class LiftBoxExpert:
         config: how it moves.
     """
 
-    def __init__(
-        self, environment: CommandEnvironment, task: LiftBox, config: ExpertConfig | None = None
-    ) -> None:
+    def __init__(self, environment: CommandEnvironment, task: LiftBox, config: ExpertConfig | None = None) -> None:
         self.config = ExpertConfig() if config is None else config
         self._environment, self._task = environment, task
         self._period = environment.decision_period
@@ -204,7 +206,11 @@ class LiftBoxExpert:
         config, memory, period = self.config, self._memory, self._period
         phase = memory.phase
         position_error, yaw_error = self._stand_error(measured, situation)
-        off = position_error.norm(dim=-1) / config.position_tolerance
+        in_box_frame = rotate_about_vertical(-yaw_error, position_error)
+        off = torch.maximum(
+            in_box_frame[:, 0].abs() / config.position_tolerance,
+            in_box_frame[:, 1].abs() / config.lateral_tolerance,
+        )
         off = torch.maximum(off, yaw_error.abs() / config.yaw_tolerance)
         memory.time = memory.time + period
         loaded = (situation.palm_force > 0.6 * config.force).all(dim=1)
@@ -248,9 +254,7 @@ class LiftBoxExpert:
     def _stand_error(self, measured: Measurement, situation: Situation) -> tuple[Tensor, Tensor]:
         """Where to stand from the feet: position (N, 2) [m] in the heading frame, and yaw (N,) [rad]."""
         box_yaw = situation.yaw_error
-        back = rotate_about_vertical(
-            box_yaw, torch.tensor([-self.config.stand_off, 0.0]).expand(len(box_yaw), 2)
-        )
+        back = rotate_about_vertical(box_yaw, torch.tensor([-self.config.stand_off, 0.0]).expand(len(box_yaw), 2))
         return self._near_face_from_feet(measured, situation) + back, box_yaw
 
     def _near_face_from_feet(self, measured: Measurement, situation: Situation) -> Tensor:
@@ -327,9 +331,7 @@ class LiftBoxExpert:
         offset = side[None, :, None] * (apart + 0.012)[:, None, None] * left[:, None]
         target = middle[:, None] + offset
         target = self._within_reach(target, measured)
-        error = (
-            middle[:, None] + side[None, :, None] * apart[:, None, None] * left[:, None] - robot.palm_position
-        )
+        error = middle[:, None] + side[None, :, None] * apart[:, None, None] * left[:, None] - robot.palm_position
         self._correct(error)
 
         pelvis = self._pelvis_attitude(measured, situation)
@@ -360,6 +362,7 @@ class LiftBoxExpert:
         lifting = memory.phase >= LIFT
         error = situation.torso_pitch - pitch
         gain = torch.where(lifting, self.config.pitch_filter, 1.0)
+        gain = torch.where(memory.phase == HOLD, self.config.hold_filter, gain)
         memory.pitch_error = memory.pitch_error + gain * (error - memory.pitch_error)
         zero = torch.zeros_like(pitch)
         torso = from_roll_pitch_yaw(torch.stack([zero, pitch + memory.pitch_error, measured.heading], -1))

@@ -75,9 +75,7 @@ def observe_situation(measured: Measurement, box_pose: Tensor, size: Tensor, pal
     to_face = rotate(both, face_centers) + position[:, None] - robot.palm_position
     local = rotate_inverse(both, robot.palm_position - position[:, None])
     beside = (local.abs() - half[:, None]).clamp_min(0.0)
-    distance = torch.stack([beside[..., 0], local[..., 1] - side * half[:, 1:2], beside[..., 2]], -1).norm(
-        dim=-1
-    )
+    distance = torch.stack([beside[..., 0], local[..., 1] - side * half[:, 1:2], beside[..., 2]], -1).norm(dim=-1)
     # The palm's normal points at the other hand: -y on the left, +y on the right.
     inwards = torch.zeros_like(robot.palm_position)
     inwards[..., 1] = -side

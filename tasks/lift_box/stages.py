@@ -104,9 +104,7 @@ def advance(
     )
     passed = torch.stack([getattr(conditions, item.name) for item in fields(conditions)], dim=1)
     following = progress.stage.clamp(max=len(STAGES) - 1)
-    progress.stage = progress.stage + (
-        passed.gather(1, following[:, None])[:, 0] & (progress.stage < len(STAGES))
-    )
+    progress.stage = progress.stage + (passed.gather(1, following[:, None])[:, 0] & (progress.stage < len(STAGES)))
     progress.lost_time = torch.where((progress.stage >= LIFT) & ~both, progress.lost_time + period, 0.0)
     return conditions
 

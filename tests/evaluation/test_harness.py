@@ -50,9 +50,7 @@ def test_robots_start_standing_at_the_commanded_height(arena: Arena, controller:
     assert first.since_change.tolist() == pytest.approx([0.02] * 4)
 
 
-def test_an_episode_repeats_exactly_and_does_not_depend_on_its_company(
-    arena: Arena, controller: Controller
-) -> None:
+def test_an_episode_repeats_exactly_and_does_not_depend_on_its_company(arena: Arena, controller: Controller) -> None:
     episodes = standing(controller, 4)
     together = joints(arena, episodes)
     assert torch.equal(together, joints(arena, episodes))
@@ -69,9 +67,7 @@ def test_batch_size_changes_no_more_than_rounding(controller: Controller) -> Non
         arena = Arena(controller, FLAT, num_threads=1, batch=batch)
         final = torch.zeros(5, 29)
 
-        def observe(
-            first: int, group: Sequence[Episode], final: torch.Tensor = final
-        ) -> Callable[[Moment], None]:
+        def observe(first: int, group: Sequence[Episode], final: torch.Tensor = final) -> Callable[[Moment], None]:
             def see(moment: Moment) -> None:
                 final[first : first + len(group)] = moment.measured.robot.joint_position[: len(group)]
 

@@ -139,8 +139,7 @@ def test_steady_figures_begin_two_seconds_after_a_change(arena: Arena, controlle
 
 def test_walking_counts_falls_and_speed(arena: Arena, controller: Controller) -> None:
     episodes = [
-        replace(episode, duration=0.3)
-        for episode in walking_episodes(controller.config.command_space, 2, 0, 1)
+        replace(episode, duration=0.3) for episode in walking_episodes(controller.config.command_space, 2, 0, 1)
     ]
     assert episodes[0].commands[0, 0] == 0.5 and episodes[0].commands[0, 1:3].abs().max() == 0.0
     episodes[1] = replace(episodes[1], pushes=(Push(0.0, (0.0, 12.0, 0.0)),))

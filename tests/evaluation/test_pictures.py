@@ -41,18 +41,14 @@ def test_the_camera_follows_position_and_heading(twin: VisualTwin) -> None:
     assert after.azimuth - camera.azimuth == pytest.approx(np.degrees(1.0), abs=1e-3)
 
 
-def test_without_opengl_there_is_one_clear_sentence(
-    monkeypatch: pytest.MonkeyPatch, twin: VisualTwin
-) -> None:
+def test_without_opengl_there_is_one_clear_sentence(monkeypatch: pytest.MonkeyPatch, twin: VisualTwin) -> None:
     def refuse(command: list[str], **options: object) -> subprocess.CompletedProcess:
         return subprocess.CompletedProcess(command, returncode=1)
 
     monkeypatch.setattr(pictures.subprocess, "run", refuse)
     find_platform.cache_clear()
     try:
-        with pytest.raises(
-            NoOpenGLError, match="install libegl1 and libgl1-mesa-dri, or libosmesa6"
-        ) as failure:
+        with pytest.raises(NoOpenGLError, match="install libegl1 and libgl1-mesa-dri, or libosmesa6") as failure:
             Painter(twin.model)
         assert "\n" not in str(failure.value)
     finally:

@@ -95,14 +95,10 @@ def test_a_live_view_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_twin_has_the_simulated_pose_and_sizes(arena: Arena, twin: VisualTwin) -> None:
-    (moment,) = list(
-        arena.run([constant(0, 0.02, arena.controller.config.command_space.neutral(), flag=1.0)])
-    )
+    (moment,) = list(arena.run([constant(0, 0.02, arena.controller.config.command_space.neutral(), flag=1.0)]))
     twin.adopt_sizes(arena.simulation, 0)
     twin.follow(arena.simulation, 0)
-    np.testing.assert_allclose(
-        twin.data.body("pelvis").xpos, moment.measured.robot.base_position[0], atol=1e-6
-    )
+    np.testing.assert_allclose(twin.data.body("pelvis").xpos, moment.measured.robot.base_position[0], atol=1e-6)
     simulated = arena.simulation.robot_model(0)
     np.testing.assert_array_equal(twin.model.geom("terrain_3").size, simulated.geom("terrain_3").size)
     assert twin.model.nmesh > 20 and simulated.nmesh == 0

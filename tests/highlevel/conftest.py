@@ -19,9 +19,7 @@ def coarse_physics() -> PhysicsConfig:
 
 
 @pytest.fixture
-def make_environment(
-    untrained_controller: Path, coarse_physics: PhysicsConfig
-) -> Callable[..., CommandEnvironment]:
+def make_environment(untrained_controller: Path, coarse_physics: PhysicsConfig) -> Callable[..., CommandEnvironment]:
     torch.set_num_threads(1)
 
     def make(num_envs: int = 2, seed: int = 0) -> CommandEnvironment:

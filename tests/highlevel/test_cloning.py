@@ -47,9 +47,7 @@ def _short_wins(environment: CommandEnvironment, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(environment.task, "step", judge)
 
 
-def test_recorded_returns_are_discounted_sums(
-    make_environment: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recorded_returns_are_discounted_sums(make_environment: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     environment = make_environment(2)
     _short_wins(environment, monkeypatch, 3)
     expert = _Standing(environment)
@@ -95,9 +93,7 @@ def test_cloning_learns_a_known_policy_and_its_value(make_environment: Make) -> 
     size = environment.observation_size
     scale = torch.ones(size)
     network = PlannerNetwork(hidden=(64, 64))
-    model = PPO(
-        "MlpPolicy", PlannerVecEnv(environment), policy_kwargs=policy_arguments(network, scale), device="cpu"
-    )
+    model = PPO("MlpPolicy", PlannerVecEnv(environment), policy_kwargs=policy_arguments(network, scale), device="cpu")
     rng = np.random.default_rng(0)
     observation = np.full((3000, size), 3.0, np.float32)
     observation[:, :21] += 2.0 * rng.normal(size=(3000, 21))
@@ -123,9 +119,7 @@ def test_cloning_refuses_foreign_demonstrations(make_environment: Make) -> None:
 
     def demonstrations(count: int, width: int) -> Demonstrations:
         zeros = np.zeros((count, width), np.float32)
-        return Demonstrations(
-            zeros, np.zeros((count, 21), np.float32), np.zeros(count, np.float32), np.zeros(count), 1
-        )
+        return Demonstrations(zeros, np.zeros((count, 21), np.float32), np.zeros(count, np.float32), np.zeros(count), 1)
 
     with pytest.raises(ValueError, match="record them again"):
         clone(model.policy, demonstrations(4, 3), scale, CloningConfig(), seed=0)
@@ -146,9 +140,7 @@ def test_episode_records_do_not_depend_on_the_number_of_robots(
 
         def observe(observation: Tensor, action: Tensor, result: StepResult, into: list = distances) -> None:
             into += [
-                (int(n), float(o[0]))
-                for n, o, d in zip(result.episode, observation, result.done, strict=True)
-                if d
+                (int(n), float(o[0])) for n, o, d in zip(result.episode, observation, result.done, strict=True) if d
             ]
 
         records = run_episodes(environment, _Standing(environment), 5, seed=9, observers=[observe])

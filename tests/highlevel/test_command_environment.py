@@ -34,9 +34,7 @@ def test_the_same_seed_gives_the_same_episodes_in_the_same_and_in_another_instan
     for environment in (first, first, second):
         start = environment.reset(seed=5)
         results = _run(environment, actions)
-        runs.append(
-            (start, torch.stack([r.observation for r in results]), torch.stack([r.reward for r in results]))
-        )
+        runs.append((start, torch.stack([r.observation for r in results]), torch.stack([r.reward for r in results])))
     for other in runs[1:]:
         for a, b in zip(runs[0], other, strict=True):
             torch.testing.assert_close(a, b, rtol=0, atol=0)

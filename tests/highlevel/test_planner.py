@@ -39,9 +39,7 @@ def planner(make_environment: Make, untrained_controller: Path) -> Planner:
     return Planner(config, actor, {"decisions": 0})
 
 
-def test_a_saved_planner_loads_and_acts_the_same(
-    planner: Planner, tmp_path: Path, make_environment: Make
-) -> None:
+def test_a_saved_planner_loads_and_acts_the_same(planner: Planner, tmp_path: Path, make_environment: Make) -> None:
     planner.save(tmp_path)
     loaded = Planner.load(tmp_path)
     assert loaded.config == planner.config
@@ -56,9 +54,7 @@ def test_the_exported_actor_equals_stable_baselines_deterministic_prediction(mak
     environment = make_environment()
     network = PlannerNetwork(hidden=(16, 8))
     scale = torch.linspace(0.5, 2.0, environment.observation_size)
-    model = PPO(
-        "MlpPolicy", PlannerVecEnv(environment), policy_kwargs=policy_arguments(network, scale), device="cpu"
-    )
+    model = PPO("MlpPolicy", PlannerVecEnv(environment), policy_kwargs=policy_arguments(network, scale), device="cpu")
     with torch.no_grad():
         model.policy.action_net.weight.mul_(40.0)
     observation = np.random.default_rng(0).normal(size=(6, environment.observation_size)).astype(np.float32)

@@ -34,9 +34,7 @@ def test_highlevel_knows_no_task_by_name() -> None:
             is_default = path.name == "trainer.py" and 'task: str = "' in line
             is_prose = path.name in ("__init__.py", "task.py") and "``" in line
             if not (is_default or is_prose):
-                assert not any(word in line.lower().replace("/", "") for word in names), (
-                    f"{path.name}: {number}"
-                )
+                assert not any(word in line.lower().replace("/", "") for word in names), f"{path.name}: {number}"
 
 
 def test_a_folder_without_a_task_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

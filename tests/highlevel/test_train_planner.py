@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from highlevel.environment import PhysicsConfig
+from highlevel.demonstrations import Demonstrations
+from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.planner import Planner
 from highlevel.train import main
 from highlevel.trainer import BEST_FOLDER, LOG_FILE, STATE_FILE, read_run_description
@@ -90,3 +93,36 @@ def test_a_damaged_state_is_refused(untrained_controller: Path, tmp_path: Path, 
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(SystemExit, match="is not a training state"):
         main(["--resume", str(tmp_path / "run")])
+
+
+def test_cloning_comes_first_and_the_actor_waits_for_the_critic(
+    untrained_controller: Path,
+    tmp_path: Path,
+    quick_episodes: None,
+    make_environment: Callable[..., CommandEnvironment],
+) -> None:
+    environment = make_environment(2)
+    rng = np.random.default_rng(0)
+    width = environment.observation_size
+    demonstrations = Demonstrations(
+        rng.normal(size=(200, width)).astype(np.float32),
+        rng.uniform(-1, 1, (200, 21)).astype(np.float32),
+        rng.normal(size=200).astype(np.float32),
+        np.repeat(np.arange(20), 10),
+        attempts=25,
+    )
+    recorded = tmp_path / "recorded.npz"
+    demonstrations.save(recorded)
+    start = [*_TINY, f"--controller={untrained_controller}", f"--output={tmp_path}", "--cloning.epochs=2"]
+    start += [f"--demonstration-file={recorded}", "--ppo.warm-up-updates=2", "--selection-episodes=1"]
+    main([*start, "--name=warming", "--total-decisions=128"])
+    main([*start, "--name=learning", "--total-decisions=192"])
+    cloned = Planner.load(tmp_path / "warming" / "cloned").actor.state_dict()
+    warm = torch.load(tmp_path / "warming" / STATE_FILE, weights_only=True)["policy"]
+    late = torch.load(tmp_path / "learning" / STATE_FILE, weights_only=True)["policy"]
+    torch.testing.assert_close(warm["action_net.weight"], cloned["output.weight"], rtol=0, atol=0)
+    torch.testing.assert_close(warm["features_extractor.mean"], cloned["mean"], rtol=0, atol=0)
+    assert not torch.equal(late["action_net.weight"], cloned["output.weight"])
+    assert not torch.equal(warm["value_net.weight"], late["value_net.weight"])
+    entries = [json.loads(line) for line in (tmp_path / "warming" / LOG_FILE).read_text().splitlines()]
+    assert entries[0]["cloning/train_error"] > 0.0 and entries[0]["decisions"] == 0

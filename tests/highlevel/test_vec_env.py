@@ -24,9 +24,7 @@ Make = Callable[..., CommandEnvironment]
 def test_the_gymnasium_environment_passes_both_checkers(
     untrained_controller: Path, coarse_physics: PhysicsConfig
 ) -> None:
-    environment = gymnasium.make(
-        "pilot/LiftBox-v0", controller=untrained_controller, physics=coarse_physics
-    ).unwrapped
+    environment = gymnasium.make("pilot/LiftBox-v0", controller=untrained_controller, physics=coarse_physics).unwrapped
     assert isinstance(environment, PlannerEnv)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -24,14 +24,10 @@ def _random_joints(count: int, seed: int) -> np.ndarray:
 
 def test_palm_poses_equal_pinocchios(arms: ArmKinematics) -> None:
     joints = _random_joints(6, 0)
-    pose = arms.forward(
-        torch.tensor(joints[:, WAIST_JOINTS]).float(), torch.tensor(joints[:, ARM_JOINTS]).float()
-    )
+    pose = arms.forward(torch.tensor(joints[:, WAIST_JOINTS]).float(), torch.tensor(joints[:, ARM_JOINTS]).float())
     kinematics = Kinematics()
     for i, row in enumerate(joints):
-        q = np.concatenate(
-            [[1.0, 2.0, 3.0], pin.Quaternion(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3)).coeffs(), row]
-        )
+        q = np.concatenate([[1.0, 2.0, 3.0], pin.Quaternion(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3)).coeffs(), row])
         placements = kinematics.placements(q)
         for side, name in enumerate(PALM_FRAMES):
             expected = placements["pelvis"].actInv(placements[name])
@@ -50,11 +46,7 @@ def test_the_jacobian_equals_finite_differences(arms: ArmKinematics) -> None:
             ahead, behind = arms.forward(waist, position + change), arms.forward(waist, position - change)
             linear = (ahead.position - behind.position)[:, side] / (2 * step)
             torch.testing.assert_close(pose.jacobian[:, side, :3, joint], linear, atol=2e-3, rtol=0)
-            turn = (
-                (ahead.rotation - behind.rotation)[:, side]
-                / (2 * step)
-                @ pose.rotation[:, side].transpose(-1, -2)
-            )
+            turn = (ahead.rotation - behind.rotation)[:, side] / (2 * step) @ pose.rotation[:, side].transpose(-1, -2)
             angular = torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1)
             torch.testing.assert_close(pose.jacobian[:, side, 3:, joint], angular, atol=2e-3, rtol=0)
 

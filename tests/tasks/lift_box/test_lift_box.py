@@ -69,9 +69,7 @@ def test_every_robot_has_its_own_box_and_it_rests_on_its_support(make: Make) -> 
         )
         np.testing.assert_allclose(model.body(BOX).inertia, expected, rtol=1e-5)
         for geom in HAND_GEOMS:
-            assert model.geom(geom).friction[0] == pytest.approx(
-                task.episode.friction[robot].item(), rel=1e-5
-            )
+            assert model.geom(geom).friction[0] == pytest.approx(task.episode.friction[robot].item(), rel=1e-5)
         top = model.geom(SUPPORT).pos[2] + model.geom(SUPPORT).size[2]
         height = task.episode.support_height[robot].item()
         assert top == pytest.approx(height, abs=1e-6) if height > 0 else top < -0.01

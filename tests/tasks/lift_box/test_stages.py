@@ -28,9 +28,7 @@ _FAR = Situation(
     torso_pitch=torch.zeros(1),
     base_height=torch.tensor([0.76]),
 )
-_NEAR = replace(
-    _FAR, near_face=torch.tensor([[0.3, 0.0, -0.6]]), yaw_error=torch.zeros(1), speed=torch.zeros(1)
-)
+_NEAR = replace(_FAR, near_face=torch.tensor([[0.3, 0.0, -0.6]]), yaw_error=torch.zeros(1), speed=torch.zeros(1))
 _REACHED = replace(_NEAR, palm_distance=torch.full((1, 2), 0.01))
 _SQUEEZED = replace(_REACHED, palm_force=torch.tensor([[20.0, 25.0]]))
 _LIFTED = replace(_SQUEEZED, bottom=torch.tensor([0.15]))
