@@ -1,1 +1,1 @@
-"""."""
+"""Tasks for the planner, one folder each, found by name."""
