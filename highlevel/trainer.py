@@ -97,7 +97,7 @@ class PlannerTrainingConfig:
     """Successful expert episodes to imitate first; 0 trains from nothing."""
     demonstration_file: Path | None = None
     """Use these recorded demonstrations instead of recording new ones."""
-    demonstration_noise: float = 0.05
+    demonstration_noise: float = 0.02
     """Standard deviation of the noise on the expert's executed actions."""
     total_decisions: int = 3_000_000
     """Planner decisions of PPO, over all robots."""
@@ -376,6 +376,7 @@ class PlannerTrainer:
 
     def _log(self, figures: dict[str, float]) -> None:
         decisions = self.model.num_timesteps
+        figures = {name: value for name, value in figures.items() if math.isfinite(value)}
         writer = SummaryWriter(str(self.folder / "tensorboard"))
         for name, value in figures.items():
             writer.add_scalar(name, value, decisions)

@@ -18,7 +18,7 @@ def test_the_story_is_that_of_the_numbered_episode(untrained_controller: Path, t
         stories.append(story)
     assert not stories[0].success and stories[0].failure is not None
     assert not np.array_equal(stories[0].instants["start"], stories[1].instants["start"])
-    assert list(stories[1].instants)[0] == "start" and list(stories[1].instants)[-1] == "end"
+    assert next(iter(stories[1].instants)) == "start" and list(stories[1].instants)[-1] == "end"
     box = twin.model.geom("box").size
     assert ((box >= 0.125) & (box <= 0.175)).all() and len(set(box.tolist())) == 3, "the box has a drawn size"
 
