@@ -54,8 +54,8 @@ def run(arguments: Arguments) -> PlannerTrainer:
     trainer = _resumed(arguments.resume) if arguments.resume else _fresh(arguments)
     print(f"training in {trainer.folder}", flush=True)
     trainer.run()
-    rate = f"success rate {trainer.best_rate:.1%} on the selection episodes" if trainer.best_rate >= 0 else "none yet"
-    print(f"best planner: {rate}; results lie in {trainer.folder}, the planner in its folder {BEST_FOLDER}")
+    best = f"best planner {trainer.folder / BEST_FOLDER} with {trainer.best_rate:.1%} success on the selection episodes"
+    print(f"{best if trainer.best_rate >= 0 else 'no planner yet'}; results lie in {trainer.folder}")
     return trainer
 
 
