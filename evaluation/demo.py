@@ -179,6 +179,7 @@ def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tupl
             result = environment.step(policy.act(observation), auto_reset=False)
             observation = result.observation
             progress.update(bar, advance=1)
+        progress.update(bar, completed=environment.max_decisions)
     instants["end"] = environment.simulation.robot_data(0).qpos.copy()
     story = Story(
         success=bool(result.success[0]),

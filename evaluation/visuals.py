@@ -62,12 +62,9 @@ def _decorate(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
     spec.visual.headlight.diffuse = [0.6, 0.6, 0.6]
     spec.visual.headlight.specular = [0.1, 0.1, 0.1]
-    spec.worldbody.add_light(
-        pos=[0, 0, 6],
-        dir=[0.2, 0.3, -1],
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        diffuse=[0.5, 0.5, 0.5],
-    )
+    light = spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.2, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    light.diffuse = [0.5, 0.5, 0.5]
+    light.castshadow = False  # on an infinite floor its shadow map only makes patterns
     gradient, checker = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, mujoco.mjtBuiltin.mjBUILTIN_CHECKER
     spec.add_texture(
         name="sky",

@@ -141,6 +141,8 @@ def _add_feet(spec: mujoco.MjSpec, options: ModelOptions) -> None:
             sphere.mass = 0.0
             sphere.contype, sphere.conaffinity = WORLD_COLLISION, 0
             sphere.condim = 3
+            # A foot's friction is its own, not the larger of foot and ground, so that it can be randomised.
+            sphere.priority = 1
             sphere.friction = [options.friction, 0.005, 0.0001]
             sphere.group = 3
 

@@ -2,6 +2,7 @@
 
 from dataclasses import fields, replace
 
+import mujoco
 import pytest
 import torch
 
@@ -97,14 +98,28 @@ def test_control_period_is_checked() -> None:
         PilotEnvironment(replace(SMALL, timestep=0.005))
 
 
-def test_zero_action_stands_for_a_second_from_any_height() -> None:
-    environment = PilotEnvironment(replace(QUIET, num_robots=16, start_in_posture=1.0), seed=2)
+def test_zero_action_stands_for_a_second_from_any_height_where_feet_do_not_slip() -> None:
+    grip = replace(RandomizationConfig.for_evaluation(), friction=(1.0, 1.0))
+    environment = PilotEnvironment(replace(QUIET, num_robots=16, start_in_posture=1.0, randomization=grip), seed=2)
     environment.open_range = CommandRange(velocity=0.0, height=1.0, torso=0.0, arms=0.0)
     environment.reset()
     results = [environment.step(torch.zeros(16, 29)) for _ in range(50)]
     assert not torch.stack([result.terminated for result in results]).any()
     error = results[-1].measured.base_height - results[-1].command[:, HEIGHT]
     assert error.abs().max() < 0.06
+
+
+def test_friction_of_the_feet_is_the_one_that_was_drawn() -> None:
+    environment = PilotEnvironment(replace(QUIET, randomization=replace(QUIET.randomization, friction=(0.4, 0.5))))
+    environment.reset()
+    for _ in range(10):  # until the feet have landed
+        environment.step(torch.zeros(6, 29))
+    for robot in range(6):
+        model, data = environment.simulation.robot_model(robot), environment.simulation.robot_data(robot)
+        mujoco.mj_forward(model, data)
+        drawn = environment.randomizer.state.friction[robot].item()
+        assert data.ncon > 0
+        assert [contact.friction[0] for contact in data.contact] == pytest.approx([drawn] * data.ncon)
 
 
 def test_falls_terminate_and_time_limits_truncate() -> None:
