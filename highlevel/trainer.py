@@ -15,13 +15,11 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import torch
@@ -41,6 +39,7 @@ from highlevel.task import load_task
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.controller import Controller, content_hash
 from lowlevel.files import atomic_write
+from lowlevel.interrupts import stop_on_signals
 from lowlevel.plain import from_plain
 from lowlevel.provenance import git_revision
 
@@ -185,7 +184,7 @@ class PlannerTrainer:
 
     def run(self) -> None:
         """Go through the remaining phases; Ctrl-C and SIGTERM end the run with its work saved."""
-        with self._signals():
+        with stop_on_signals(self._request_stop):
             if self.phase == "demonstrations":
                 self._imitate()
             if self.phase == "ppo" and not self._stop_requested:
@@ -385,17 +384,9 @@ class PlannerTrainer:
         with (self.folder / LOG_FILE).open("a") as file:
             file.write(json.dumps({name: float(f"{value:.6g}") for name, value in entry.items()}) + "\n")
 
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        def request_stop(number: int, frame: FrameType | None) -> None:
-            self._stop_requested = True
-
-        previous = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+    def _request_stop(self) -> None:
+        """End the run at the next safe point, with its work saved."""
+        self._stop_requested = True
 
 
 class _TrainingCallback(BaseCallback):

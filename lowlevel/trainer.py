@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
-from types import FrameType
 from typing import Any
 
 import torch
@@ -22,6 +20,7 @@ from lowlevel.curriculum import Curriculum, CurriculumConfig
 from lowlevel.distributed import average_over_ranks, rank, world_size
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
 from lowlevel.files import atomic_write
+from lowlevel.interrupts import stop_on_signals
 from lowlevel.measures import TRACKING_FIGURES
 from lowlevel.networks import NetworkConfig, ObservationSizes
 from lowlevel.observation import (
@@ -125,7 +124,7 @@ class Trainer:
         if not self.observation:
             self.observation = self.environment.reset(spread_episodes=True)
         last_save = time.monotonic()
-        with self._signals(), self._progress() as (progress, task), self._log() as log:
+        with stop_on_signals(self._request_stop), self._progress() as (progress, task), self._log() as log:
             while self.steps < self.config.total_steps and not self._stop_requested:
                 started = time.monotonic()
                 figures = self.iterate()
@@ -225,19 +224,9 @@ class Trainer:
             f"  E_v {figures['tracking/E_v']:.2f}  {figures['speed/steps_per_second']:.0f} steps/s"
         )
 
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        """Ctrl-C and SIGTERM end the run after the current iteration, with its work saved."""
-
-        def request_stop(number: int, frame: FrameType | None) -> None:
-            self._stop_requested = True
-
-        previous = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+    def _request_stop(self) -> None:
+        """End the run at the next safe point, with its work saved."""
+        self._stop_requested = True
 
     @contextmanager
     def _progress(self) -> Iterator[tuple[Progress, Any]]:
