@@ -22,6 +22,7 @@ from robots.g1.constants import (
     PALM_OFFSET,
     PELVIS_BODY,
     SIDES,
+    SOLE_OFFSET,
     TORSO_BODY,
     urdf_path,
 )
@@ -32,8 +33,10 @@ PALM_COLLISION = 2
 """Collision bit of manipulated objects: palms touch these, feet touch both."""
 
 _FOOT_SPHERES = ((-0.05, 0.025), (-0.05, -0.025), (0.12, 0.03), (0.12, -0.03))
-_FOOT_SPHERE_RADIUS = 0.005
-_FOOT_SPHERE_HEIGHT = -0.03
+_FOOT_SPHERE_RADIUS = 0.02
+"""Edge radius of the sole [m]. It must exceed what a foot sinks in on impact: the URDF's 5 mm spheres sink below the
+top of the next slab and are stopped by its side, even where slabs differ by a millimetre."""
+_FOOT_SPHERE_HEIGHT = SOLE_OFFSET + _FOOT_SPHERE_RADIUS
 
 
 @dataclass(frozen=True)
@@ -50,8 +53,8 @@ class ModelOptions:
     """Elliptic friction cones with impratio 10 (grasping) instead of pyramidal ones (locomotion, cheaper)."""
     floor: bool = True
     """Add an infinite ground plane named ``floor``."""
-    solver_iterations: int = 3
-    """Newton iterations per step; 3 is enough for feet on the ground, grasping wants more."""
+    solver_iterations: int = 10
+    """Most Newton iterations per step; it stops early once converged. With 3, feet of friction 0.5 never come to rest."""
     friction: float = 1.0
     """Sliding friction coefficient of floor, feet and palms."""
 
@@ -108,7 +111,7 @@ def _set_physics(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.iterations = options.solver_iterations
-    spec.option.ls_iterations = 5 if options.solver_iterations <= 5 else 20
+    spec.option.ls_iterations = 20
     if options.elliptic_friction:
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = 10.0
@@ -133,7 +136,7 @@ def _add_actuators(spec: mujoco.MjSpec, options: ModelOptions) -> None:
 def _add_feet(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     for side, body_name in zip(SIDES, FOOT_BODIES, strict=True):
         body = spec.body(body_name)
-        body.add_site(name=f"{side}_foot", pos=[0.035, 0.0, _FOOT_SPHERE_HEIGHT - _FOOT_SPHERE_RADIUS])
+        body.add_site(name=f"{side}_foot", pos=[0.035, 0.0, SOLE_OFFSET])
         for number, (x, y) in enumerate(_FOOT_SPHERES):
             sphere = body.add_geom(name=f"{side}_foot_{number}", type=mujoco.mjtGeom.mjGEOM_SPHERE)
             sphere.size = [_FOOT_SPHERE_RADIUS, 0, 0]
