@@ -43,7 +43,7 @@ from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
     "controller.json",
     "weights.safetensors",
@@ -114,15 +114,7 @@ class Controller:
         self.device = torch.device(device)
         self.actor = actor.to(device).eval().requires_grad_(False)
         self.gains = Gains(np.array(config.stiffness), np.array(config.damping), np.array(config.action_scale))
-        self.motion = NominalMotion(
-            config.nominal,
-            self.gains,
-            torch.tensor(config.joint_lower),
-            torch.tensor(config.joint_upper),
-            config.control_period,
-            device,
-            pose,
-        )
+        self.motion = NominalMotion(config.nominal, self.gains, config.control_period, device, pose)
         self.action_scale = torch.tensor(config.action_scale, device=device)
         self._build_frame = FrameBuilder(config.command_space, self.motion, device)
         self._memory: _Memory | None = None

@@ -16,18 +16,25 @@ import torch
 from torch import Tensor
 
 from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, POSTURE, TORSO, VELOCITY, is_walking
-from lowlevel.rotations import conjugate, from_roll_pitch_yaw, multiply, rotate_inverse
+from lowlevel.rotations import conjugate, from_roll_pitch_yaw, multiply, rotate, rotate_inverse
+from robots.g1.arm_mass import ArmMass
 from robots.g1.constants import (
     ARM_JOINTS,
     DEFAULT_POSITION,
+    LEG_JOINTS,
     LOWER_JOINTS,
     NUM_JOINTS,
+    SIDES,
+    TOTAL_MASS,
     WAIST_JOINTS,
     Gains,
     joint_index,
 )
 from robots.g1.nominal_pose import NominalPose
 
+GRAVITY = 9.81
+"""[m/s^2]"""
+_HIP_PITCH = [joint_index(f"{side}_hip_pitch_joint") for side in SIDES]
 _WAIST_AGAINST_LEAN = ("waist_pitch_joint", "waist_roll_joint")
 """Waist joints that undo a lean along x (forwards) and along y (to the left)."""
 
@@ -43,9 +50,9 @@ class NominalConfig:
     """Show the gait clock to the policy (sine and cosine, zero while standing); an addition to the paper."""
     gait_frequency: float = 2.0
     """Steps of one foot per second [Hz]."""
-    height_rate: float = 0.5
+    height_rate: float = 0.25
     """Slew rate of the base height reference [m/s]."""
-    torso_rate: float = 1.5
+    torso_rate: float = 1.0
     """Slew rate of the torso attitude reference [rad/s]."""
     arm_rate: float = 4.0
     """Slew rate of the arm reference [rad/s]."""
@@ -55,8 +62,13 @@ class NominalConfig:
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
     lateral_shift: float = 0.05
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
-    stride: tuple[float, float, float] = (0.22, 0.22, 0.11)
-    """Hip swing per commanded vx, vy [rad per m/s] and yaw rate [rad per rad/s]."""
+    stride: tuple[float, float, float] = (0.28, 0.15, 0.11)
+    """Hip swing per commanded vx, vy [rad per m/s] and yaw rate [rad per rad/s]. A foot that lands half a step ahead
+    of the hip keeps the speed; one further ahead brakes."""
+    carry_arms: bool = True
+    """Shift the pelvis against the arms' weight and bear its moment; False: as if the arms hung at their default."""
+    largest_shift: float = 0.08
+    """Largest such shift along x and along y [m]."""
     balance_stiffness: float = 2.5
     """Ankle correction per tilt of the pelvis off its nominal attitude [rad/rad]; 0 switches the strategy off."""
     balance_damping: float = 0.2
@@ -66,9 +78,11 @@ class NominalConfig:
     rights the body."""
     step_damping: float = 0.27
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
-    lean: tuple[float, float] = (0.18, 0.5)
+    lean: tuple[float, float] = (0.3, 0.55)
     """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
     chase it carry the robot along."""
+    largest_lean: float = 0.2
+    """Largest lean along x and along y [rad]."""
 
 
 @dataclass
@@ -90,8 +104,6 @@ class NominalMotion:
         self,
         config: NominalConfig,
         gains: Gains,
-        joint_lower: Tensor,
-        joint_upper: Tensor,
         control_period: float,
         device: torch.device | str = "cpu",
         pose: NominalPose | None = None,
@@ -100,12 +112,14 @@ class NominalMotion:
         self.config = config
         self.control_period = control_period
         self.pose = NominalPose.load(device) if pose is None else pose
-        self.lower, self.upper = joint_lower.to(device), joint_upper.to(device)
         self.default = torch.tensor(DEFAULT_POSITION, dtype=torch.float32, device=device)
         stiffness = torch.tensor(gains.stiffness[LOWER_JOINTS], dtype=torch.float32, device=device)
         self._inverse_stiffness = 1.0 / stiffness
         rate = torch.full((COMMAND_SIZE,), math.inf, device=device)
         rate[HEIGHT], rate[TORSO], rate[ARMS] = config.height_rate, config.torso_rate, config.arm_rate
+        self.arm_mass = ArmMass(device)
+        self._default_moment = self.arm_mass.first_moment(self.default[None, ARM_JOINTS])
+        self._unit = torch.eye(3, device=device)
         self._stride = torch.tensor(config.stride, device=device)
         self._largest_change = rate * control_period
 
@@ -153,20 +167,52 @@ class NominalMotion:
     def joint_targets(self, state: NominalState, projected_gravity: Tensor, base_angular_velocity: Tensor) -> Tensor:
         """Nominal PD targets (N, 29) [rad], gravity compensated by the table's static torques.
 
+        They may lie beyond the joint limits: a joint that rests at its limit needs such a target to push against it.
+
         ``projected_gravity`` (N, 3) and ``base_angular_velocity`` (N, 3) [rad/s] as measured, pelvis frame.
         """
         targets = self.default.expand(len(state.phase), NUM_JOINTS).clone()
         targets[:, ARM_JOINTS] = state.reference[:, ARMS]
         if self.config.kind == "default":
             return targets
-        position, torque = self.pose.lookup(state.reference[:, POSTURE])
+        position, torque, shift = self.pose.lookup(state.reference[:, POSTURE])
+        if self.config.carry_arms:
+            position, torque = self._carry_arms(state.reference, position, torque, shift)
         targets[:, LOWER_JOINTS] = position + torque * self._inverse_stiffness
         if self.config.kind == "march":
             self._add_march(targets, state)
         if self.config.balance_stiffness > 0.0:
             attitude = self.pelvis_attitude(state.reference[:, TORSO], position[:, WAIST_JOINTS])
             self._add_balance(targets, state, attitude, projected_gravity, base_angular_velocity)
-        return targets.clamp(self.lower, self.upper)
+        return targets
+
+    def _carry_arms(self, reference: Tensor, position: Tensor, torque: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions and gravity torques (N, 15) for arms that are not at their default, as the table assumes.
+
+        The pelvis moves until the centre of mass is back where the table has it; waist and hips bear the moment.
+        """
+        moment = self.arm_mass.first_moment(reference[:, ARMS]) - self._default_moment
+        torso = from_roll_pitch_yaw(reference[:, TORSO])
+        offset = -rotate(torso, moment)[:, :2] / TOTAL_MASS
+        offset = offset.clamp(-self.config.largest_shift, self.config.largest_shift)
+        position = position.clone()
+        position[:, LEG_JOINTS] += torch.einsum("njk,nk->nj", shift, offset)
+
+        weight = torch.zeros_like(moment)
+        weight[:, 2] = -GRAVITY
+        load = torch.linalg.cross(moment, rotate_inverse(torso, weight))
+        yaw, roll, pitch = position[:, WAIST_JOINTS].unbind(1)
+        zero = torch.zeros_like(yaw)
+        to_torso = conjugate(from_roll_pitch_yaw(torch.stack([zero, pitch, zero], -1)))
+        roll_axis = rotate(to_torso, self._unit[0].expand_as(load))
+        untilted = conjugate(from_roll_pitch_yaw(torch.stack([roll, zero, zero], -1)))
+        yaw_axis = rotate(to_torso, rotate(untilted, self._unit[2].expand_as(load)))
+        torque = torque.clone()
+        torque[:, WAIST_JOINTS] -= torch.stack(
+            [(yaw_axis * load).sum(-1), (roll_axis * load).sum(-1), load[:, 1]], dim=1
+        )
+        torque[:, _HIP_PITCH] += 0.5 * rotate(torso, load)[:, 1:2]
+        return position, torque
 
     def _add_march(self, targets: Tensor, state: NominalState) -> None:
         config = self.config
@@ -207,7 +253,7 @@ class NominalMotion:
         down[:, 2] = -1.0
         wanted = rotate_inverse(attitude, down)
         for axis, lean in enumerate(config.lean):
-            angle = lean * state.reference[:, axis] * state.walking
+            angle = (lean * state.reference[:, axis]).clamp(-config.largest_lean, config.largest_lean) * state.walking
             wanted[:, axis] += angle
             # The waist takes the lean back, so that the torso keeps its commanded attitude.
             targets[:, joint_index(_WAIST_AGAINST_LEAN[axis])] += (-angle, angle)[axis]

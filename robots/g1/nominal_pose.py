@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +21,19 @@ PATH = Path(__file__).with_name("nominal_pose.npz")
 """The table shipped with the package."""
 
 NUM_LOWER_JOINTS = 15
+NUM_LEG_JOINTS = 12
+
+
+class NominalStance(NamedTuple):
+    """What the table holds for N postures."""
+
+    position: Tensor
+    """Leg and waist joints (N, 15) [rad]."""
+    torque: Tensor
+    """What holds them against gravity with the weight on both feet (N, 15) [N m]: PD targets of position +
+    torque / stiffness do not sag."""
+    shift: Tensor
+    """Change of the leg joints (N, 12, 2) [rad/m] that moves the pelvis along x and y over the standing feet."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +73,8 @@ def interpolate(axes: Sequence[Axis], table: Tensor, point: Tensor) -> Tensor:
 class NominalPose:
     """The table on one device.
 
-    ``axes``: height [m], roll, pitch, yaw [rad] of the posture grid. ``values`` (nodes, 30): joint positions
-    [rad] and static gravity torques [N m] of the 15 leg and waist joints. ``roll_limit`` (nodes of height x
+    ``axes``: height [m], roll, pitch, yaw [rad] of the posture grid. ``values`` (nodes, 54): joint positions
+    [rad] and static gravity torques [N m] of the 15 leg and waist joints, shift of the 12 leg joints [rad/m]. ``roll_limit`` (nodes of height x
     |yaw|, 1) and ``pitch_limits`` (nodes of height x |roll| x |yaw|, 2) bound the postures that can be held
     [rad].
     """
@@ -88,9 +102,8 @@ class NominalPose:
             grid = (len(height), len(roll), len(pitch), len(yaw))
             half = (len(height), len(roll) // 2 + 1, len(yaw) // 2 + 1)
             nodes = int(np.prod(grid))
-            values = np.concatenate([arrays["positions"], arrays["torques"]], axis=-1).reshape(
-                nodes, 2 * NUM_LOWER_JOINTS
-            )
+            columns = [arrays[name].reshape(nodes, -1) for name in ("positions", "torques", "shifts")]
+            values = np.concatenate(columns, axis=-1).reshape(nodes, 2 * NUM_LOWER_JOINTS + 2 * NUM_LEG_JOINTS)
             roll_limit = arrays["roll_limit"].reshape(half[0] * half[2], 1)
             pitch_limits = arrays["pitch_limits"].reshape(int(np.prod(half)), 2)
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -104,14 +117,11 @@ class NominalPose:
         axes = tuple(Axis(float(axis[0]), float(axis[-1]), len(axis)) for axis in (height, roll, pitch, yaw))
         return cls(axes, tensor(values), tensor(roll_limit), tensor(pitch_limits))  # type: ignore[arg-type]
 
-    def lookup(self, posture: Tensor) -> tuple[Tensor, Tensor]:
-        """Joint positions (N, 15) [rad] and gravity torques (N, 15) [N m] for ``posture`` (N, 4).
-
-        The torques hold the pose with the weight on both feet, so that PD targets of position + torque /
-        stiffness do not sag. Postures outside the grid are moved to its border.
-        """
+    def lookup(self, posture: Tensor) -> NominalStance:
+        """The stance for each ``posture`` (N, 4); postures outside the grid are moved to its border."""
         values = interpolate(self.axes, self.values, posture)
-        return values[:, :NUM_LOWER_JOINTS], values[:, NUM_LOWER_JOINTS:]
+        position, torque, shift = values.split([NUM_LOWER_JOINTS, NUM_LOWER_JOINTS, 2 * NUM_LEG_JOINTS], dim=1)
+        return NominalStance(position, torque, shift.unflatten(1, (NUM_LEG_JOINTS, 2)))
 
     def clamp(self, posture: Tensor) -> Tensor:
         """Move ``posture`` (N, 4) into the region that can be held: the one feasibility rule for commands.
