@@ -32,13 +32,13 @@ STAGES: tuple[Stage, ...] = (
 class CurriculumConfig:
     """Where the ranges start and how they grow."""
 
-    start: CommandRange = field(default_factory=lambda: CommandRange(velocity=0.4, height=0.1, torso=0.1, arms=0.0))
+    start: CommandRange = field(default_factory=lambda: CommandRange(velocity=0.5, height=0.5, torso=0.5, arms=0.1))
     """Opening of each range at the start; small instead of zero, so that no input is constant."""
     growth: float = 0.004
     """Largest growth of a factor per update."""
     required_opening: float = 0.6
     """A stage grows only when the stage before it is open at least this far."""
-    survival: float = 0.6
+    survival: float = 0.3
     """Mean episode length, as a share of the longest, below which nothing grows."""
 
 

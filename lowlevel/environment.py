@@ -47,7 +47,7 @@ MAP_REFRESH_STEPS = 5
 class EnvironmentConfig:
     """Everything about the low-level task except learning."""
 
-    num_robots: int = 512
+    num_robots: int = 1024
     """Robots simulated side by side."""
     num_threads: int = 2
     """Physics threads."""
@@ -142,7 +142,7 @@ class PilotEnvironment:
         self.command_space = command_space(lower.tolist(), upper.tolist())
         self.sampler = CommandSampler(self.command_space, config.mixture, device)
         gains = GAINS[config.gains]
-        self.motion = NominalMotion(config.nominal, gains, lower, upper, self.control_period, device)
+        self.motion = NominalMotion(config.nominal, gains, self.control_period, device)
         self.action_scale = torch.tensor(gains.action_scale, dtype=torch.float32, device=device)
         self.build_frame = FrameBuilder(self.command_space, self.motion, device)
         self.randomizer = Randomizer(config.randomization, self.simulation, self.generator)

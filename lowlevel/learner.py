@@ -40,9 +40,9 @@ POLICY_KEYS = ("frame", "elevation_map", "flag", "velocity", "latent")
 class PPOConfig:
     """Settings of the learner."""
 
-    steps_per_update: int = 12
+    steps_per_update: int = 8
     """Control steps per robot and update."""
-    epochs: int = 4
+    epochs: int = 2
     """Passes over the rollout per update."""
     minibatches: int = 4
     """Gradient steps per pass."""
@@ -56,11 +56,11 @@ class PPOConfig:
     """KL divergence from the acting policy that steers the actor's learning rate [nat]; 0 keeps the rate."""
     actor_learning_rate: float = 3e-4
     """First learning rate of the actor."""
-    actor_learning_rate_bounds: tuple[float, float] = (1e-5, 1e-3)
+    actor_learning_rate_bounds: tuple[float, float] = (1e-5, 2e-3)
     """Range of the actor's adaptive learning rate."""
-    critic_learning_rate: float = 5e-4
+    critic_learning_rate: float = 1e-3
     """Learning rate of the critic."""
-    estimator_epochs: int = 2
+    estimator_epochs: int = 1
     """Passes in which the estimator learns too; as a supervised learner it needs fewer."""
     estimator_learning_rate: float = 5e-4
     """Learning rate of the history encoder, the next-state encoder and the prototypes."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from lowlevel.commands import is_walking
+from lowlevel.commands import STANDING_SPEED, is_walking
 from lowlevel.measures import Measurement, arm_error, height_error, stumbles, torso_error, velocity_error
 from robots.g1.constants import joint_index
 
@@ -37,7 +37,9 @@ class RewardWeights:
     foot_phase: float = 2.0
     """Feet follow the gait clock: swing foot up, stance foot down."""
     base_motion: float = -0.05
-    """Vertical and tumbling motion of the pelvis."""
+    """Tumbling motion of the pelvis."""
+    velocity_progress: float = 1.0
+    """Share of the commanded horizontal velocity that is reached, up to all of it."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,17 @@ def base_motion(t: Transition) -> Tensor:
     return t.measured.robot.base_angular_velocity[:, :2].square().sum(-1)
 
 
+def velocity_progress(t: Transition) -> Tensor:
+    """Velocity along the command over the commanded speed, in [0, 1]; 1 where no horizontal velocity is commanded.
+
+    The tracking kernels are flat far from their goal: at 0.2 m/s of commanded 1.0 they hardly pay for speed.
+    """
+    wanted = t.command[:, :2]
+    speed = wanted.norm(dim=-1).clamp_min(STANDING_SPEED)
+    along = (t.measured.linear_velocity[:, :2] * wanted).sum(-1) / speed.square()
+    return torch.where(wanted.norm(dim=-1) < STANDING_SPEED, 1.0, along.clamp(0.0, 1.0))
+
+
 REWARD_TERMS: dict[str, Callable[[Transition], Tensor]] = {
     term.__name__: term
     for term in (
@@ -171,6 +184,7 @@ REWARD_TERMS: dict[str, Callable[[Transition], Tensor]] = {
         no_fly,
         foot_phase,
         base_motion,
+        velocity_progress,
     )
 }
 
