@@ -48,6 +48,18 @@ class Push:
 
 
 @dataclass(frozen=True)
+class HandLoad:
+    """What a box squeezed between the palms does to the hands: it pushes them apart and hangs from them."""
+
+    outward: float
+    """Force on each hand along the line between the palms, away from the other hand [N]."""
+    downward: float
+    """Force on each hand [N]."""
+    begin: float = 0.0
+    """When it sets in, for the rest of the episode [s]."""
+
+
+@dataclass(frozen=True)
 class Episode:
     """What happens to one robot: it starts standing at rest and is given piecewise constant commands."""
 
@@ -64,6 +76,7 @@ class Episode:
     tile: int = 0
     """Index of the terrain tile to start on."""
     pushes: tuple[Push, ...] = ()
+    load: HandLoad | None = None
 
 
 @dataclass(frozen=True)
@@ -74,6 +87,8 @@ class Moment:
     """Control steps before this one."""
     measured: Measurement
     """At the end of the step."""
+    targets: Tensor
+    """PD targets of the step (N, 29) [rad]."""
     command: Tensor
     """The clamped command that the step tracked (N, 21)."""
     flag: Tensor
@@ -99,6 +114,19 @@ def episode_seeds(seed: int, index: int) -> tuple[int, int]:
 def constant(seed: int, duration: float, command: Tensor, flag: float, tile: int = 0) -> Episode:
     """An episode with one ``command`` (21,) throughout."""
     return Episode(seed, duration, (0.0,), command[None], torch.tensor([flag]), tile)
+
+
+def hand_forces(palm_position: Tensor, outward: Tensor, downward: Tensor) -> Tensor:
+    """Forces on left and right hand (N, 2, 3) [N], world frame.
+
+    ``palm_position`` (N, 2, 3) [m]; ``outward`` (N,) along the line between the palms and ``downward`` (N,) are
+    per hand [N].
+    """
+    across = palm_position[:, 0] - palm_position[:, 1]
+    to_the_left = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-3)
+    force = torch.stack([to_the_left, -to_the_left], dim=1) * outward[:, None, None]
+    force[..., 2] -= downward[:, None]
+    return force
 
 
 class Arena:
@@ -161,6 +189,7 @@ class Arena:
         lengths[: len(episodes)] = torch.tensor([self._steps(episode.duration) for episode in episodes])
         starts, commands, flags = self._schedules(episodes)
         pushes = self._pushes(episodes)
+        load_begin, outward, downward = self._loads(episodes)
         frame_noise, map_noise = self._start(episodes)
         self.controller.reset(self.batch)
         active = lengths > 0
@@ -176,12 +205,17 @@ class Arena:
             targets = self.controller.act(proprioception, elevation, command, flag)
             if step in pushes:
                 self.simulation.push(pushes[step])
+            bears = load_begin <= step
+            if bears.any():
+                palms = measured.robot.palm_position
+                self.simulation.set_hand_force(hand_forces(palms, bears * outward, bears * downward))
             self.simulation.step(targets)
             measured = measure(self.simulation.read(), self.terrain)
             fallen = has_fallen(measured, self.controller.reference) | self.simulation.diverged()
             yield Moment(
                 step=step,
                 measured=measured,
+                targets=targets,
                 command=command,
                 flag=flag,
                 since_change=(step + 1 - starts[rows, current]) * self.period,
@@ -222,6 +256,16 @@ class Arena:
                 change = pushes.setdefault(self._steps(push.time), torch.zeros(self.batch, 3))
                 change[row] += torch.tensor(push.velocity_change)
         return pushes
+
+    def _loads(self, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor, Tensor]:
+        """First step with a load (N,), and its outward and downward force per hand (N,) [N]."""
+        begin = torch.full((self.batch,), torch.iinfo(torch.long).max)
+        outward, downward = torch.zeros(self.batch), torch.zeros(self.batch)
+        for row, episode in enumerate(episodes):
+            if episode.load is not None:
+                begin[row] = self._steps(episode.load.begin)
+                outward[row], downward[row] = episode.load.outward, episode.load.downward
+        return begin, outward, downward
 
     def _start(self, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor]:
         """Draw everything random and put all robots on their feet.

@@ -27,6 +27,8 @@ from evaluation.reports import (
     write_metrics,
     write_results,
 )
+from evaluation.skills import EPISODES as SKILL_EPISODES
+from evaluation.skills import FLAT, SKILLS, run_skills, skill_episodes, skills_section
 from evaluation.statistics import Figure
 from evaluation.tracking import (
     COMMAND_INTERVAL,
@@ -77,6 +79,8 @@ class Arguments:
     """Folder for report.md, metrics.json and plots; files of an earlier report there are replaced."""
     walk_episodes: int = WALK_EPISODES
     """Episodes of the walking test: 10 s at 0.5 m/s."""
+    skill_episodes: int = SKILL_EPISODES
+    """Episodes of each skill test: deep bend, bend and walk with a box, stop, push; 0 leaves them out."""
     robots: int = BATCH
     """Robots side by side; the last digits of the figures depend on it."""
     threads: int = os.cpu_count() or 1
@@ -117,6 +121,8 @@ def _run(arguments: Arguments) -> None:
     for name in ("episodes", "walk_episodes", "robots", "threads"):
         if getattr(arguments, name) < 1:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
+    if arguments.skill_episodes < 0:
+        raise ValueError("--skill-episodes must not be negative")
     if not 0 <= arguments.record <= min(arguments.robots, arguments.episodes):
         raise ValueError("--record must be between 0 and the number of episodes and of robots")
     suite_terrain(arguments.suite)
@@ -143,7 +149,7 @@ def _run(arguments: Arguments) -> None:
 
 
 def evaluate(controller: Controller, identity: str, arguments: Arguments) -> Evaluation:
-    """Run the protocol, the walking test and the motion modes."""
+    """Run the protocol, the walking test, the motion modes and the skill tests."""
     began = time.monotonic()
     terrain = suite_terrain(arguments.suite)
     space, tiles, seed = controller.config.command_space, len(terrain.tiles), arguments.seed
@@ -151,8 +157,9 @@ def evaluate(controller: Controller, identity: str, arguments: Arguments) -> Eva
     protocol = protocol_episodes(space, arguments.episodes, seed, tiles)
     walks = walking_episodes(space, arguments.walk_episodes, seed, tiles)
     modes = mode_episodes(space, seed)
+    skills = {skill.name: skill_episodes(skill, space, arguments.skill_episodes, seed) for skill in SKILLS}
     with progress_bar() as progress:
-        total = sum(batch_steps(arena, episodes) for episodes in (protocol, walks, modes))
+        total = sum(batch_steps(arena, episodes) for episodes in (protocol, walks, modes, *skills.values()))
         task = progress.add_task("tracking", total=total)
 
         def advance(steps: int) -> None:
@@ -163,11 +170,16 @@ def evaluate(controller: Controller, identity: str, arguments: Arguments) -> Eva
         walking = run_walking(arena, walks, advance)
         progress.update(task, description="experts")
         activations = run_modes(arena, modes, advance)
+        figures = tracking_figures(tracking, terrain.tiles) | walking
+        if arguments.skill_episodes:
+            progress.update(task, description="skills")
+            flat = Arena(controller, FLAT, num_threads=arguments.threads, batch=arguments.robots)
+            figures |= run_skills(flat, skills, advance)
     return Evaluation(
         suite=arguments.suite,
         seed=seed,
         controller=identity,
-        figures=tracking_figures(tracking, terrain.tiles) | walking,
+        figures=figures,
         tracking=tracking,
         modes=tuple(motion_modes(space)),
         activations=activations,
@@ -240,6 +252,7 @@ def report_text(evaluation: Evaluation) -> str:
     """``report.md``."""
     figures = evaluation.figures
     survival, speed = figures["walk_half_mps_survival"], figures["walk_half_mps_speed"]
+    energy, action_rate = figures["energy_per_metre"], figures["action_rate"]
     episodes = len(evaluation.tracking.tiles)
     return "\n".join(
         [
@@ -253,6 +266,10 @@ def report_text(evaluation: Evaluation) -> str:
             "",
             markdown_table(["figure", "unit", "ours", "ours, steady", "paper"], _main_rows(figures, evaluation.suite)),
             "![tracking](tracking.png)",
+            "",
+            f"Travelling costs {format_figure(energy, 0)} J per metre: the sum of |torque times joint speed| over all "
+            "steps whose command asks for translation, by the way made good in the commanded direction. From one "
+            f"control step to the next a joint's target moves by {format_figure(action_rate, 4)} rad on average.",
             "",
             "## By kind of command",
             "",
@@ -275,6 +292,7 @@ def report_text(evaluation: Evaluation) -> str:
             f"{format_figure(speed)} m/s. A share of {format_figure(figures['walk_half_mps_success'])} "
             "neither falls nor stays below half the commanded speed.",
             "",
+            *([skills_section(figures)] if "deep_bend_success" in figures else []),
             "## Experts",
             "",
             "Mean activation of each expert in six motion modes, after the transient; blank where no robot stayed up.",

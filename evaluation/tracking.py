@@ -2,7 +2,7 @@
 
 Episodes last 20 s with a new command every 10 s from a fixed mixture, without pushes, with observation noise,
 friction 0.6 to 1.0 and physics at 2 ms. An episode that ends in a fall counts in full, at the mean error it
-had until then.
+had until then. Beside the tracking errors stand what walking costs and how fast the joint targets move.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from evaluation.statistics import Figure, mean_figure, share_figure
 from lowlevel.commands import (
     ARMS,
     HEIGHT,
+    STANDING_SPEED,
     TORSO,
     VELOCITY,
     CommandMixture,
@@ -104,11 +105,30 @@ class TrackingResult:
     """Category -> 1 for a fall, 0 for none, NaN for no such step (episodes,)."""
     transient: np.ndarray
     """Mean figures over the time since the command changed (steps, figures)."""
+    energy: np.ndarray
+    """Mechanical work, both signs counted positive, on commands to travel (episodes,) [J]."""
+    progress: np.ndarray
+    """Way made good in the commanded directions on the same steps (episodes,) [m]."""
+    action_rate: np.ndarray
+    """Mean change of a joint's target from one control step to the next (episodes,) [rad]."""
     tiles: np.ndarray
     """Tile that each episode started on (episodes,)."""
 
 
 CATEGORIES = ("all", *GROUPS)
+
+
+def travel_effort(moment: Moment) -> tuple[Tensor, Tensor]:
+    """Power sum |torque * joint speed| (N,) [W] and speed in the commanded direction (N,) [m/s].
+
+    Both are zero where the episode is over or the command asks for no translation: turning on the spot gets nowhere.
+    """
+    robot, wanted = moment.measured.robot, moment.command[:, VELOCITY][:, :2]
+    speed = wanted.norm(dim=-1)
+    counted = moment.active & (speed >= STANDING_SPEED)
+    power = (robot.joint_torque * robot.joint_velocity).abs().sum(-1)
+    made_good = (moment.measured.linear_velocity[:, :2] * wanted).sum(-1) / speed.clamp_min(STANDING_SPEED)
+    return torch.where(counted, power, 0.0), torch.where(counted, made_good, 0.0)
 
 
 def run_tracking(
@@ -121,11 +141,23 @@ def run_tracking(
     counts = np.zeros((len(names), len(episodes)))
     falls = np.zeros((len(names), len(episodes)))
     transient_sums, transient_counts = np.zeros((bins, len(TRACKING_FIGURES))), np.zeros(bins)
+    energy, progress = np.zeros(len(episodes)), np.zeros(len(episodes))
+    changes, change_counts = np.zeros(len(episodes)), np.zeros(len(episodes))
 
     def observe(first: int, batch: Sequence[Episode]) -> Callable[[Moment], None]:
         rows = slice(first, first + len(batch))
+        previous_targets: Tensor | None = None
 
         def add(moment: Moment) -> None:
+            nonlocal previous_targets
+            power, speed = (value.numpy()[: len(batch)].astype(float) for value in travel_effort(moment))
+            energy[rows] += power * arena.period
+            progress[rows] += speed * arena.period
+            if previous_targets is not None:
+                change = (moment.targets - previous_targets).abs().mean(dim=-1)
+                changes[rows] += torch.where(moment.active, change, 0.0).numpy()[: len(batch)]
+                change_counts[rows] += moment.active.numpy()[: len(batch)]
+            previous_targets = moment.targets
             errors = torch.stack(
                 [function(moment.measured, moment.command) for _, function in TRACKING_FIGURES.values()], -1
             )
@@ -151,17 +183,21 @@ def run_tracking(
         means = sums / counts[:, :, None]
         fell = np.where(counts > 0, falls, np.nan)
         transient = transient_sums / transient_counts[:, None]
+        action_rate = changes / change_counts
     tiles = np.array([episode.tile for episode in episodes])
     return TrackingResult(
         errors=dict(zip(names, means, strict=True)),
         falls=dict(zip(names, fell, strict=True)),
         transient=transient,
+        energy=energy,
+        progress=progress,
+        action_rate=action_rate,
         tiles=tiles,
     )
 
 
 def tracking_figures(result: TrackingResult, tile_names: Sequence[str]) -> dict[str, Figure]:
-    """Figures by name: ``E_v``, ``E_v_steady``, ``E_v_walk_only`` and so on, and the fall rates."""
+    """Figures by name: ``E_v``, ``E_v_steady``, ``E_v_walk_only`` and so on, fall rates, and what walking costs."""
     figures = {}
     for category in ("all", "all_steady", *GROUPS, *(f"{group}_steady" for group in GROUPS)):
         suffix = category.removeprefix("all").removeprefix("_")
@@ -174,7 +210,23 @@ def tracking_figures(result: TrackingResult, tile_names: Sequence[str]) -> dict[
         for column, (name, (unit, _)) in enumerate(TRACKING_FIGURES.items()):
             figures[f"{name}_on_{tile_name}"] = mean_figure(result.errors["all"][rows, column], unit)
         figures[f"fall_rate_on_{tile_name}"] = share_figure(result.falls["all"][rows] > 0)
+    figures["energy_per_metre"] = energy_per_metre(result.energy, result.progress)
+    figures["action_rate"] = mean_figure(result.action_rate, "rad")
     return figures
+
+
+def energy_per_metre(energy: np.ndarray, progress: np.ndarray) -> Figure:
+    """All work over all way made good [J/m], from episodes' ``energy`` [J] and ``progress`` [m]; both (episodes,).
+
+    Single episodes give no usable ratio: one that only staggers on the spot has made no way. The ratio of the sums is
+    the mean of its own linearisation, one number per episode, which gives the interval.
+    """
+    travelled = energy > 0.0
+    energy, progress = energy[travelled], progress[travelled]
+    if progress.sum() <= 0.0:
+        return Figure(None, "J/m", None, 0)
+    ratio = energy.sum() / progress.sum()
+    return mean_figure(ratio + (energy - ratio * progress) / progress.mean(), "J/m")
 
 
 def _join(name: str, suffix: str) -> str:

@@ -9,12 +9,23 @@ import numpy as np
 import pytest
 import torch
 
-from evaluation.harness import Arena, Episode, Moment, Push, batch_steps, constant, episode_seeds, run_all
+from evaluation.harness import (
+    Arena,
+    Episode,
+    HandLoad,
+    Moment,
+    Push,
+    batch_steps,
+    constant,
+    episode_seeds,
+    hand_forces,
+    run_all,
+)
 from lowlevel.commands import HEIGHT, VELOCITY
 from lowlevel.controller import Controller
 from lowlevel.observation import NoiseConfig
 from lowlevel.terrain import TerrainConfig
-from robots.g1.constants import FOOT_BODIES
+from robots.g1.constants import FOOT_BODIES, HAND_BODIES
 
 FLAT = TerrainConfig(tile_size=16.0)
 QUIET = NoiseConfig(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -120,6 +131,38 @@ def test_a_push_changes_the_velocity_of_its_robot_only(controller: Controller) -
     change = after - before
     assert 0.3 < change[0, 0] < 0.9 and change[0, 1].abs() < 0.2
     assert change[1].abs().max() == 0.0
+
+
+def test_hand_forces_point_away_from_the_other_hand() -> None:
+    palms = torch.tensor([[[0.3, 0.15, 1.0], [0.3, -0.15, 1.0]], [[0.0, 0.0, 1.3], [0.4, 0.0, 1.0]]])
+    force = hand_forces(palms, torch.tensor([15.0, 10.0]), torch.tensor([5.0, 0.0]))
+    torch.testing.assert_close(force[0], torch.tensor([[0.0, 15.0, -5.0], [0.0, -15.0, -5.0]]))
+    # Unit vector (-0.8, 0, 0.6) from the right hand to the left one.
+    torch.testing.assert_close(force[1], torch.tensor([[-8.0, 0.0, 6.0], [8.0, 0.0, -6.0]]))
+
+
+def test_a_load_bears_on_its_robot_from_its_time_on(arena: Arena, controller: Controller) -> None:
+    loaded, left_alone = standing(controller, 2)
+    loaded = replace(loaded, load=HandLoad(outward=15.0, downward=5.0, begin=0.1))
+    hands = [arena.simulation.model.body(name).id for name in HAND_BODIES]
+    palms = []
+    for moment in arena.run([loaded, left_alone]):
+        force = arena.simulation.robot_data(0).xfrc_applied[hands]
+        if moment.step < 5:
+            assert not force.any()
+        else:
+            # Acts along the line between the palms at the beginning of the step.
+            across = (palms[-1][0, 0] - palms[-1][0, 1]).numpy()
+            outward = 15.0 * across / np.linalg.norm(across)
+            np.testing.assert_allclose(force[0, :3], outward - [0.0, 0.0, 5.0], atol=1e-4)
+            np.testing.assert_allclose(force[1, :3], -outward - [0.0, 0.0, 5.0], atol=1e-4)
+        assert not force[:, 3:].any() and not arena.simulation.robot_data(1).xfrc_applied.any()
+        palms.append(moment.measured.robot.palm_position)
+    unloaded = [m.measured.robot.palm_position for m in arena.run([replace(loaded, load=None), left_alone])]
+    assert not arena.simulation.robot_data(0).xfrc_applied.any(), "the next episode starts without it"
+    apart = [(end[-1][0, 0] - end[-1][0, 1]).norm() for end in (palms, unloaded)]
+    assert apart[0] > apart[1] + 0.002
+    assert torch.equal(palms[4][0], unloaded[4][0]) and torch.equal(palms[-1][1], unloaded[-1][1])
 
 
 def test_a_fall_ends_its_episode_only(arena: Arena, controller: Controller) -> None:

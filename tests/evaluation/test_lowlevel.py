@@ -17,9 +17,11 @@ from safetensors.torch import load_file, save_file
 
 from evaluation.harness import Arena, Push
 from evaluation.lowlevel import main
+from evaluation.skills import BARS
 from evaluation.statistics import wilson_interval
 from evaluation.tracking import (
     GROUPS,
+    energy_per_metre,
     group_of,
     mode_episodes,
     motion_modes,
@@ -137,6 +139,54 @@ def test_steady_figures_begin_two_seconds_after_a_change(arena: Arena, controlle
     assert result.errors["all_steady"][0, column] == pytest.approx(expected, rel=1e-4)
 
 
+def test_effort_agrees_with_a_plain_recount(arena: Arena, controller: Controller) -> None:
+    """Four commands: diagonally, turning on the spot, standing, and forwards until a fall."""
+    episodes = protocol_episodes(controller.config.command_space, 4, 1, 1, duration=0.4)
+    velocities = torch.tensor([[0.3, -0.4, 0.2], [0.0, 0.0, 0.8], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    for row, velocity in enumerate(velocities):
+        commands = episodes[row].commands.clone()
+        commands[:, :3] = velocity
+        episodes[row] = replace(episodes[row], commands=commands)
+    episodes[3] = replace(episodes[3], pushes=(Push(0.1, (0.0, 12.0, 0.0)),))
+    result = run_tracking(arena, episodes)
+    work, way, changes = np.zeros(4), np.zeros(4), [[] for _ in range(4)]  # type: ignore[var-annotated]
+    before = None
+    for moment in arena.run(episodes):
+        robot = moment.measured.robot
+        for row in range(4):
+            if not moment.active[row]:
+                continue
+            if before is not None:
+                changes[row].append(np.abs(moment.targets[row].numpy() - before[row]).mean())
+            if row in (0, 3):
+                watts = robot.joint_torque[row].numpy() * robot.joint_velocity[row].numpy()
+                work[row] += 0.02 * np.abs(watts).sum()
+                direction = np.array([0.6, -0.8]) if row == 0 else np.array([1.0, 0.0])
+                way[row] += 0.02 * moment.measured.linear_velocity[row, :2].numpy() @ direction
+        before = moment.targets.numpy()
+    assert result.falls["all"][3] == 1.0 and len(changes[3]) < len(changes[0]) == 19
+    np.testing.assert_allclose(result.energy, work, rtol=1e-4)
+    np.testing.assert_allclose(result.progress, way, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(result.action_rate, [np.mean(values) for values in changes], rtol=1e-4)
+    figures = tracking_figures(result, ["flat"])
+    assert figures["action_rate"].value == pytest.approx(result.action_rate.mean()) and figures["action_rate"].n == 4
+
+
+def test_energy_per_metre_is_a_ratio_of_sums() -> None:
+    """A still episode and one without translation commands change nothing; the interval is that of the ratio."""
+    figure = energy_per_metre(np.array([400.0, 0.0, 800.0, 100.0]), np.array([2.0, 0.0, 3.0, 0.0]))
+    assert figure.value == pytest.approx(1300.0 / 5.0) and figure.n == 3 and figure.unit == "J/m"
+    rng = np.random.default_rng(0)
+    way = rng.uniform(1.0, 9.0, 300)
+    energy = 200.0 * way + rng.normal(0.0, 60.0, 300)
+    figure = energy_per_metre(energy, way)
+    picks = rng.integers(0, 300, (4000, 300))
+    low, high = np.percentile(energy[picks].sum(axis=1) / way[picks].sum(axis=1), [2.5, 97.5])
+    assert figure.ci95 is not None
+    assert figure.ci95 == pytest.approx((low, high), abs=0.1 * (high - low))
+    assert energy_per_metre(np.array([50.0]), np.array([-0.1])).value is None, "went backwards"
+
+
 def test_walking_counts_falls_and_speed(arena: Arena, controller: Controller) -> None:
     episodes = [
         replace(episode, duration=0.3) for episode in walking_episodes(controller.config.command_space, 2, 0, 1)
@@ -186,8 +236,12 @@ def test_suites() -> None:
 
 
 def test_command_writes_a_report(
-    untrained_controller: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    untrained_controller: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("evaluation.tracking.MODE_EPISODES", 1)
     folder = tmp_path / "controller"
     shutil.copytree(untrained_controller, folder)
     output = tmp_path / "results" / "report"
@@ -195,6 +249,8 @@ def test_command_writes_a_report(
         "--episodes",
         "2",
         "--walk-episodes",
+        "1",
+        "--skill-episodes",
         "1",
         "--seed",
         "5",
@@ -219,6 +275,9 @@ def test_command_writes_a_report(
     low, high = content["figures"]["E_v"]["ci95"]
     assert low <= content["figures"]["E_v"]["value"] <= high
     assert {"E_stumble", "fall_rate", "E_arm_steady", "walk_half_mps_survival"} <= set(content["figures"])
+    assert {"energy_per_metre", "action_rate", *BARS} <= set(content["figures"])
+    assert content["figures"]["push_success"]["n"] == 1
+    assert "## Skills" in (output / "report.md").read_text()
     assert "0.145" in (output / "report.md").read_text(), "the paper's figure stands beside ours"
     assert str(output / "report.md") in capsys.readouterr().out
     stored = json.loads((folder / "controller.json").read_text())["provenance"]["metrics"]
@@ -267,6 +326,7 @@ def test_a_bad_controller_is_refused_in_one_sentence(
     [
         (["--suite", "hard"], "unknown suite 'hard'"),
         (["--episodes", "0"], "--episodes must be at least 1"),
+        (["--skill-episodes", "-1"], "--skill-episodes must not be negative"),
         (["--record", "33"], "--record must be between"),
         (["--output", "{file}/report"], "is not a folder"),
     ],
