@@ -54,7 +54,7 @@ class ModelOptions:
     floor: bool = True
     """Add an infinite ground plane named ``floor``."""
     solver_iterations: int = 10
-    """Most Newton iterations per step; it stops early once converged. With 3, feet of friction 0.5 never come to rest."""
+    """Most Newton iterations per step; it stops once converged. With 3, feet of friction 0.5 never come to rest."""
     friction: float = 1.0
     """Sliding friction coefficient of floor, feet and palms."""
 

@@ -74,9 +74,9 @@ class NominalPose:
     """The table on one device.
 
     ``axes``: height [m], roll, pitch, yaw [rad] of the posture grid. ``values`` (nodes, 54): joint positions
-    [rad] and static gravity torques [N m] of the 15 leg and waist joints, shift of the 12 leg joints [rad/m]. ``roll_limit`` (nodes of height x
-    |yaw|, 1) and ``pitch_limits`` (nodes of height x |roll| x |yaw|, 2) bound the postures that can be held
-    [rad].
+    [rad] and static gravity torques [N m] of the 15 leg and waist joints, shift of the 12 leg joints [rad/m].
+    ``roll_limit`` (nodes of height x |yaw|, 1) and ``pitch_limits`` (nodes of height x |roll| x |yaw|, 2) bound
+    the postures that can be held [rad].
     """
 
     axes: tuple[Axis, Axis, Axis, Axis]
