@@ -20,6 +20,10 @@ from lowlevel.files import atomic_write
 _NOISE_STREAM = 3
 
 
+class ExpertError(RuntimeError):
+    """The expert does not succeed; the message says what to check."""
+
+
 @dataclass(frozen=True)
 class Demonstrations:
     """Decisions of successful episodes, one after the other."""
@@ -66,6 +70,8 @@ class Demonstrations:
         """
         if not path.is_file():
             raise FileNotFoundError(f"{path} does not exist: record demonstrations first")
+        if not zipfile.is_zipfile(path):
+            raise ValueError(f"{path} does not hold demonstrations: it is damaged, truncated or something else")
         try:
             with np.load(path, allow_pickle=False) as file:
                 loaded = cls(file["observation"], file["action"], file["value"], file["episode"], int(file["attempts"]))
@@ -102,7 +108,7 @@ def record(
         should_stop: asked after every decision; what has been recorded by then is returned.
 
     Raises:
-        RuntimeError: if the expert does not succeed once in 4 ``count`` + 100 attempts.
+        ExpertError: if the expert does not succeed once in 4 ``count`` + 100 attempts.
     """
     observation = environment.reset(seed)
     expert.reset(rows(environment.num_envs))
@@ -128,7 +134,7 @@ def record(
             if on_progress is not None:
                 on_progress(len(finished), attempts)
             if not finished and attempts > 4 * count + 100:
-                raise RuntimeError(
+                raise ExpertError(
                     f"the expert failed {attempts} times in a row: check the controller with 'evaluate-lowlevel'"
                 )
         observation = result.observation

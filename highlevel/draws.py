@@ -28,7 +28,12 @@ def uniform(seed: int, episode: Tensor, stream: int, count: int) -> Tensor:
         episode: episode numbers, not negative.
         stream: what the numbers are for; other streams are independent.
         count: numbers per episode.
+
+    Raises:
+        ValueError: if the seed is negative.
     """
+    if seed < 0:
+        raise ValueError(f"the seed is {seed}, but it must not be negative")
     with np.errstate(over="ignore"):
         key = _mix(np.array([seed], dtype=np.uint64) + _GOLDEN)
         key = _mix(key + np.uint64(stream) * _GOLDEN)

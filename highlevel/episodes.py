@@ -89,3 +89,11 @@ def run_episodes(
 def success_rate(records: Sequence[EpisodeRecord]) -> float:
     """Share of successes."""
     return sum(record.success for record in records) / max(len(records), 1)
+
+
+def stage_shares(records: Sequence[EpisodeRecord], stages: Sequence[str]) -> dict[str, float]:
+    """Share of episodes that passed each of the ``stages``."""
+    return {
+        stage: sum(record.stage >= number for record in records) / max(len(records), 1)
+        for number, stage in enumerate(stages, start=1)
+    }

@@ -12,21 +12,18 @@ from typing import Annotated
 import torch
 import tyro
 
+from highlevel.demonstrations import Demonstrations, ExpertError
 from highlevel.registration import find_controller
-from highlevel.trainer import (
-    BEST_FOLDER,
-    STATE_FILE,
-    PlannerTrainer,
-    PlannerTrainingConfig,
-    read_run_description,
-    write_run_description,
-)
+from highlevel.run_folder import BEST_FOLDER, create_run, read_config
+from highlevel.trainer import PlannerTrainer
+from highlevel.training_config import PlannerTrainingConfig
+from lowlevel.checks import NonFiniteError
+from lowlevel.provenance import require_unused
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Train a planner with Stable-Baselines3 PPO: demonstrations of the scripted expert, cloning, then
-    PPO."""
+    """Train a planner with Stable-Baselines3 PPO: demonstrations of the scripted expert, cloning, then PPO."""
 
     config: Annotated[PlannerTrainingConfig, tyro.conf.arg(name="")]
     output: Path = Path("runs/highlevel")
@@ -42,45 +39,50 @@ def main(arguments: list[str] | None = None) -> None:
     given = sys.argv[1:] if arguments is None else arguments
     parsed = tyro.cli(Arguments, args=given, default=Arguments(config=PlannerTrainingConfig()))
     try:
-        if parsed.resume is not None and len(given) > 2:
-            raise ValueError("--resume takes the configuration of the run it continues: leave the other options out")
-        run(parsed)
-    except (ValueError, FileNotFoundError, FileExistsError, OSError, RuntimeError) as error:
-        sys.exit(f"train-highlevel: {error}")
-
-
-def run(arguments: Arguments) -> PlannerTrainer:
-    """Train as ``arguments`` say, and return the finished trainer."""
-    trainer = _resumed(arguments.resume) if arguments.resume else _fresh(arguments)
-    print(f"training in {trainer.folder}", flush=True)
-    trainer.run()
-    best = f"best planner {trainer.folder / BEST_FOLDER} with {trainer.best_rate:.1%} success on the selection episodes"
-    print(f"{best if trainer.best_rate >= 0 else 'no planner yet'}; results lie in {trainer.folder}")
-    return trainer
+        trainer = _resumed(given, parsed.resume) if parsed.resume else _fresh(parsed)
+        print(f"training in {trainer.folder}", flush=True)
+        trainer.run()
+    except (ValueError, OSError, ExpertError, NonFiniteError) as error:
+        first_line, _, _ = str(error).partition("\n")
+        sys.exit(f"train-highlevel: {first_line}")
+    except KeyboardInterrupt:
+        print("train-highlevel: interrupted before training began", file=sys.stderr)
+        sys.exit(130)
+    if trainer.best_rate >= 0:
+        best = trainer.folder / BEST_FOLDER
+        print(f"best planner {best} with {trainer.best_rate:.1%} success on the selection episodes")
+    if not trainer.is_finished:
+        print(f"train-highlevel: stopped; continue with --resume {trainer.folder}", file=sys.stderr)
+        sys.exit(130)
 
 
 def _fresh(arguments: Arguments) -> PlannerTrainer:
     folder = arguments.output / (arguments.name or f"{arguments.config.task}-{time.strftime('%Y%m%d-%H%M%S')}")
-    if (folder / STATE_FILE).exists():
-        raise FileExistsError(
-            f"{folder} already holds a run: continue it with --resume {folder}, or give another --name"
-        )
+    require_unused(folder)
     config = replace(arguments.config, controller=find_controller(arguments.config.controller).resolve())
-    # Physics and learning take turns on the same cores.
-    torch.set_num_threads(config.num_threads)
-    trainer = PlannerTrainer(config, folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_run_description(folder, config)
+    if config.demonstration_file is not None:
+        # A file that cannot be used is refused before anything is written.
+        Demonstrations.load(config.demonstration_file)
+        config = replace(config, demonstration_file=config.demonstration_file.resolve())
+    trainer = _trainer(config, folder)
+    create_run(folder, config)
     trainer.save()
     return trainer
 
 
-def _resumed(folder: Path) -> PlannerTrainer:
-    config = read_run_description(folder)
-    torch.set_num_threads(config.num_threads)
-    trainer = PlannerTrainer(config, folder)
+def _resumed(given: list[str], folder: Path) -> PlannerTrainer:
+    others = [word for word in given if word.startswith("--") and word.partition("=")[0] != "--resume"]
+    if others:
+        raise ValueError("--resume takes the configuration of the run it continues: leave the other options out")
+    trainer = _trainer(read_config(folder), folder)
     trainer.load()
     return trainer
+
+
+def _trainer(config: PlannerTrainingConfig, folder: Path) -> PlannerTrainer:
+    # Physics and learning take turns on the same cores.
+    torch.set_num_threads(config.num_threads)
+    return PlannerTrainer(config, folder)
 
 
 if __name__ == "__main__":

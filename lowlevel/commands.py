@@ -70,12 +70,14 @@ def command_space(joint_lower: list[float], joint_upper: list[float]) -> Command
 
 @dataclass(frozen=True)
 class CommandMixture:
-    """Shares of the command groups and their ranges; the evaluation protocol fixes the same mixture."""
+    """Shares of the command groups and their ranges; the defaults are those of the evaluation protocol."""
 
     walk_and_work: float = 0.4
     """Share of commands that walk with a posture and moving arms (I = 1)."""
     stand_and_work: float = 0.4
     """Share of commands that stand still with the full posture range and moving arms (I = 1)."""
+    stand: float = 0.0
+    """Share of commands that stand still in the neutral posture (I = 0); what is left walks in it (I = 0)."""
     walking_min_height: float = 0.55
     """Lowest base height while walking [m]."""
     walking_max_roll: float = 0.2
@@ -117,8 +119,9 @@ class CommandSampler:
             return torch.rand(*shape, generator=generator, device=self.lower.device)
 
         group = uniform(count)
-        walks = (group < mixture.walk_and_work) | (group >= mixture.walk_and_work + mixture.stand_and_work)
-        works = group < mixture.walk_and_work + mixture.stand_and_work
+        working = mixture.walk_and_work + mixture.stand_and_work
+        walks = (group < mixture.walk_and_work) | (group >= working + mixture.stand)
+        works = group < working
         command = self.neutral.repeat(count, 1)
 
         velocity = self.lower[VELOCITY] + uniform(count, 3) * (self.upper[VELOCITY] - self.lower[VELOCITY])

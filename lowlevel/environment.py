@@ -66,7 +66,10 @@ class EnvironmentConfig:
     action_limit: float = 8.0
     """Actions are clipped to +- this many action scales."""
     nominal: NominalConfig = field(default_factory=NominalConfig)
-    mixture: CommandMixture = field(default_factory=CommandMixture)
+    mixture: CommandMixture = field(
+        default_factory=lambda: CommandMixture(walk_and_work=0.35, stand_and_work=0.4, stand=0.1)
+    )
+    """Unlike the evaluation it also stands in the neutral posture: what a planner starts from and stops in."""
     terrain: TerrainConfig = field(default_factory=TerrainConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)

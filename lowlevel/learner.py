@@ -40,9 +40,9 @@ POLICY_KEYS = ("frame", "elevation_map", "flag", "velocity", "latent")
 class PPOConfig:
     """Settings of the learner."""
 
-    steps_per_update: int = 8
+    steps_per_update: int = 24
     """Control steps per robot and update."""
-    epochs: int = 2
+    epochs: int = 3
     """Passes over the rollout per update."""
     minibatches: int = 4
     """Gradient steps per pass."""
@@ -58,7 +58,7 @@ class PPOConfig:
     """First learning rate of the actor."""
     actor_learning_rate_bounds: tuple[float, float] = (1e-5, 2e-3)
     """Range of the actor's adaptive learning rate."""
-    critic_learning_rate: float = 1e-3
+    critic_learning_rate: float = 5e-4
     """Learning rate of the critic."""
     estimator_epochs: int = 1
     """Passes in which the estimator learns too; as a supervised learner it needs fewer."""

@@ -13,10 +13,19 @@ import torch
 import tyro
 
 from lowlevel import distributed
+from lowlevel.checks import NonFiniteError, require_finite
 from lowlevel.export import export_controller
 from lowlevel.presets import PRESETS
-from lowlevel.provenance import describe_run, read_training_config, write_run_description
-from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig, read_training_state
+from lowlevel.provenance import (
+    describe_run,
+    find_state,
+    make_run_folder,
+    read_run_description,
+    read_training_config,
+    require_unused,
+    write_run_description,
+)
+from lowlevel.trainer import Trainer, TrainingConfig, read_training_state
 
 
 @dataclass(frozen=True)
@@ -40,19 +49,19 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``train-lowlevel``."""
     try:
         _run(sys.argv[1:] if arguments is None else arguments)
-    except (ValueError, FileNotFoundError, FileExistsError, OSError) as error:
-        sys.exit(f"train-lowlevel: {error}")
+    except (ValueError, OSError, NonFiniteError) as error:
+        first_line, _, _ = str(error).partition("\n")
+        sys.exit(f"train-lowlevel: {first_line}")
+    except KeyboardInterrupt:
+        print("train-lowlevel: interrupted; what was saved by then can be continued with --resume", file=sys.stderr)
+        sys.exit(130)
 
 
 def _run(arguments: list[str]) -> None:
-    chosen = _choose(arguments)
-    if chosen.preset not in PRESETS:
-        raise ValueError(f"unknown preset {chosen.preset!r}; choose one of {', '.join(PRESETS)}")
-    config = read_training_config(chosen.resume) if chosen.resume else PRESETS[chosen.preset]
     parsed = tyro.cli(
         Arguments,
         args=arguments,
-        default=Arguments(config=config, preset=chosen.preset),
+        default=_defaults(arguments),
         description="Train a PILOT controller. Defaults below are those of the chosen preset or resumed run.",
     )
     device = distributed.start(parsed.config.device)
@@ -61,7 +70,7 @@ def _run(arguments: list[str]) -> None:
     try:
         trainer = _resumed(parsed) if parsed.resume else _fresh(parsed, device)
         if distributed.rank() == 0:
-            write_run_description(trainer.folder, describe_run(parsed.config, parsed.preset))
+            write_run_description(trainer.folder, describe_run(parsed.config, preset=parsed.preset))
             print(f"training in {trainer.folder}", flush=True)
         trainer.train()
         if distributed.rank() == 0:
@@ -70,44 +79,62 @@ def _run(arguments: list[str]) -> None:
                 f"{trainer.steps} steps in {trainer.trained_seconds / 3600:.2f} h; the controller lies in "
                 f"{trainer.folder / 'controller'}"
             )
+        if trainer.steps < parsed.config.total_steps:
+            print(f"train-lowlevel: stopped; continue with --resume {trainer.folder}", file=sys.stderr)
+            sys.exit(130)
     finally:
         distributed.stop()
 
 
-def _choose(arguments: list[str]) -> argparse.Namespace:
+def _defaults(arguments: list[str]) -> Arguments:
     """Preset and resumed run decide the defaults of everything else, so they are read first."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--preset", default="flat")
-    parser.add_argument("--resume", type=Path, default=None)
-    return parser.parse_known_args(arguments)[0]
+    parser.add_argument("--preset")
+    parser.add_argument("--resume", type=Path)
+    chosen = parser.parse_known_args(arguments)[0]
+    if chosen.resume is not None:
+        if chosen.preset is not None:
+            raise ValueError("--resume takes the configuration of the run it continues: leave --preset out")
+        config = read_training_config(chosen.resume)
+        return Arguments(config=config, preset=read_run_description(chosen.resume).get("preset", "unknown"))
+    preset = chosen.preset or Arguments.preset
+    if preset not in PRESETS:
+        raise ValueError(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}")
+    return Arguments(config=PRESETS[preset], preset=preset)
 
 
 def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
     folder = parsed.output / (parsed.name or f"{parsed.preset}-{time.strftime('%Y%m%d-%H%M%S')}")
-    if (folder / STATE_FILE).exists():
-        raise FileExistsError(
-            f"{folder} already holds a run: continue it with --resume {folder}, or give another --name"
-        )
+    require_unused(folder)
     trainer = Trainer(replace(parsed.config, device=str(device)), folder)
     if parsed.warm_start:
-        trainer.load_learning(read_training_state(_state_path(parsed.warm_start)))
-    folder.mkdir(parents=True, exist_ok=True)
+        _load(trainer, parsed.warm_start, learning_only=True)
+    make_run_folder(folder)
     return trainer
 
 
 def _resumed(parsed: Arguments) -> Trainer:
     assert parsed.resume is not None
-    path = _state_path(parsed.resume)
+    if parsed.warm_start:
+        raise ValueError("--warm-start begins a new run and --resume continues one: give only one of them")
     trainer = Trainer(parsed.config, parsed.resume)
-    trainer.load(path)
+    _load(trainer, parsed.resume)
     return trainer
 
 
-def _state_path(folder: Path) -> Path:
-    path = folder / STATE_FILE
-    if not path.is_file():
-        raise FileNotFoundError(f"{folder} holds no {STATE_FILE}: give the folder of a training run")
-    return path
+def _load(trainer: Trainer, run: Path, learning_only: bool = False) -> None:
+    """Continue from the training state of a run, or take over only what it has learned."""
+    path = find_state(run)
+    try:
+        if learning_only:
+            trainer.load_learning(read_training_state(path))
+        else:
+            trainer.load(path)
+    except KeyError as error:
+        raise ValueError(f"{path} is not a training state of this version: it has no {error}") from error
+    for network in (trainer.ppo.actor, trainer.ppo.critic):
+        for name, weight in network.state_dict().items():
+            require_finite(f"weight {name!r} in {path}", weight)
 
 
 if __name__ == "__main__":

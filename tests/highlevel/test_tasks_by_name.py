@@ -31,7 +31,7 @@ def test_highlevel_knows_no_task_by_name() -> None:
     for path in source.glob("*.py"):
         code = [line for line in path.read_text().splitlines() if '"""' not in line]
         for number, line in enumerate(code):
-            is_default = path.name == "trainer.py" and 'task: str = "' in line
+            is_default = path.name == "training_config.py" and 'task: str = "' in line
             is_prose = path.name in ("__init__.py", "task.py") and "``" in line
             if not (is_default or is_prose):
                 assert not any(word in line.lower().replace("/", "") for word in names), f"{path.name}: {number}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,8 +14,10 @@ import torch
 from highlevel.demonstrations import Demonstrations
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.planner import Planner
+from highlevel.run_folder import BEST_FOLDER, LOG_FILE, STATE_FILE, read_config
 from highlevel.train import main
-from highlevel.trainer import BEST_FOLDER, LOG_FILE, STATE_FILE, read_run_description
+from highlevel.trainer import PlannerTrainer
+from lowlevel.checks import NonFiniteError
 
 _TINY = [
     "--demonstrations=0",
@@ -62,7 +65,7 @@ def test_a_run_trains_and_resumes(untrained_controller: Path, tmp_path: Path, qu
     description = json.loads((folder / "run.json").read_text())
     description["config"]["total_decisions"] = 192
     (folder / "run.json").write_text(json.dumps(description))
-    assert read_run_description(folder).total_decisions == 192
+    assert read_config(folder).total_decisions == 192
     main(["--resume", str(folder)])
     resumed = torch.load(folder / STATE_FILE, weights_only=True)
     assert resumed["decisions"] == 192 and resumed["updates"] == 3
@@ -80,19 +83,83 @@ def test_bad_input_is_one_sentence(untrained_controller: Path, tmp_path: Path) -
         ([*_TINY, f"--controller={tmp_path}", f"--output={tmp_path}"], "controller.json is missing"),
         (["--resume", str(tmp_path)], "holds no run.json"),
         (["--resume", str(tmp_path), "--seed=1"], "leave the other options out"),
+        ([f"--resume={tmp_path}", "--seed=1"], "leave the other options out"),
+        ([*_TINY, *where, "--selection-episodes=0"], "selection_episodes is 0"),
+        ([*_TINY, *where, f"--demonstration-file={__file__}"], "does not hold demonstrations"),
     ):
         with pytest.raises(SystemExit, match=message):
             main(options)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_damaged_state_is_refused(untrained_controller: Path, tmp_path: Path, quick_episodes: None) -> None:
+def test_a_state_that_cannot_be_continued_is_refused(
+    untrained_controller: Path, tmp_path: Path, quick_episodes: None
+) -> None:
     start = [*_TINY, f"--controller={untrained_controller}", f"--output={tmp_path}", "--name=run"]
     main([*start, "--total-decisions=64", "--selection-episodes=1"])
-    path = tmp_path / "run" / STATE_FILE
-    path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(SystemExit, match="is not a training state"):
-        main(["--resume", str(tmp_path / "run")])
+    folder = tmp_path / "run"
+    path = folder / STATE_FILE
+    content, state = path.read_bytes(), torch.load(path, weights_only=True)
+
+    def refusal() -> str:
+        with pytest.raises(SystemExit) as exit_info:
+            main(["--resume", str(folder)])
+        assert "\n" not in str(exit_info.value)
+        return str(exit_info.value)
+
+    for length in (0, 1000):
+        path.write_bytes(content[:length])
+        assert "is not a readable training state" in refusal()
+    torch.save(state | {"controller": "0123456789abcdef"}, path)
+    assert "this run is for controller 0123456789abcdef" in refusal()
+    torch.save({name: value for name, value in state.items() if name != "episode"}, path)
+    assert "does not fit this run: 'episode'" in refusal()
+    state["policy"]["value_net.bias"][0] = torch.nan
+    torch.save(state, path)
+    assert "'value_net.bias' is not finite" in refusal()
+    path.unlink()
+    assert "ended before its first save" in refusal()
+
+
+def test_weights_that_are_not_finite_are_not_saved(
+    untrained_controller: Path, tmp_path: Path, quick_episodes: None
+) -> None:
+    start = [*_TINY, f"--controller={untrained_controller}", f"--output={tmp_path}", "--name=run"]
+    main([*start, "--total-decisions=64", "--selection-episodes=1"])
+    folder = tmp_path / "run"
+    before = (folder / STATE_FILE).read_bytes()
+    trainer = PlannerTrainer(read_config(folder), folder)
+    trainer.load()
+    with torch.no_grad():
+        trainer.model.policy.value_net.bias[0] = torch.inf
+    with pytest.raises(NonFiniteError, match=r"value_net.bias' after 64 decisions is not finite"):
+        trainer.save()
+    assert (folder / STATE_FILE).read_bytes() == before
+
+
+def test_ctrl_c_ends_a_run_that_can_be_continued(
+    untrained_controller: Path,
+    tmp_path: Path,
+    quick_episodes: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    original = PlannerTrainer.select
+
+    def interrupted(self: PlannerTrainer) -> float:
+        signal.raise_signal(signal.SIGINT)
+        return original(self)
+
+    start = [*_TINY, f"--controller={untrained_controller}", f"--output={tmp_path}", "--name=run"]
+    with monkeypatch.context() as patched:
+        patched.setattr(PlannerTrainer, "select", interrupted)
+        with pytest.raises(SystemExit) as exit_info:
+            main([*start, "--total-decisions=128"])
+    folder = tmp_path / "run"
+    assert exit_info.value.code == 130 and f"continue with --resume {folder}" in capsys.readouterr().err
+    assert torch.load(folder / STATE_FILE, weights_only=True)["decisions"] < 128
+    main(["--resume", str(folder)])
+    assert torch.load(folder / STATE_FILE, weights_only=True)["decisions"] >= 128
 
 
 def test_cloning_comes_first_and_the_actor_waits_for_the_critic(

@@ -17,7 +17,7 @@ from lowlevel.environment import EnvironmentConfig
 from lowlevel.network_config import NetworkConfig
 from lowlevel.plain import from_plain
 from lowlevel.presets import PRESETS
-from lowlevel.provenance import describe_run, read_training_config, write_run_description
+from lowlevel.provenance import describe_run, read_run_description, read_training_config, write_run_description
 from lowlevel.train import main
 from lowlevel.trainer import LOG_FILE, STATE_FILE, Trainer, TrainingConfig
 
@@ -78,9 +78,9 @@ def test_same_seed_same_weights_other_seed_other_weights(tmp_path: Path) -> None
 
 def test_configuration_survives_json(tmp_path: Path) -> None:
     for preset, config in PRESETS.items():
-        description = describe_run(config, preset)
+        description = describe_run(config, preset=preset)
         assert from_plain(TrainingConfig, json.loads(json.dumps(description["config"]))) == config
-    write_run_description(tmp_path, describe_run(PRESETS["no-moe"], "no-moe"))
+    write_run_description(tmp_path, describe_run(PRESETS["no-moe"], preset="no-moe"))
     assert read_training_config(tmp_path) == PRESETS["no-moe"]
 
 
@@ -91,7 +91,7 @@ ARGUMENTS = [
 
 
 def test_command_line_trains_exports_and_resumes(tmp_path: Path) -> None:
-    main([*ARGUMENTS, "--total-steps", "128", "--output", str(tmp_path), "--name", "run"])
+    main([*ARGUMENTS, "--preset", "no-mirror", "--total-steps", "128", "--output", str(tmp_path), "--name", "run"])
     folder = tmp_path / "run"
     Controller.load(folder / "controller")
     entries = [json.loads(line) for line in (folder / LOG_FILE).read_text().splitlines()]
@@ -101,14 +101,34 @@ def test_command_line_trains_exports_and_resumes(tmp_path: Path) -> None:
     main(["--resume", str(folder), "--total-steps", "192"])
     entries = [json.loads(line) for line in (folder / LOG_FILE).read_text().splitlines()]
     assert [entry["steps"] for entry in entries] == [64, 128, 192]
+    description = read_run_description(folder)
+    assert description["preset"] == "no-mirror" and description["config"]["ppo"]["symmetry"] == "none"
+
+
+def test_ctrl_c_ends_a_run_that_can_be_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    original = Trainer.iterate
+
+    def interrupted(self: Trainer) -> dict[str, float]:
+        signal.raise_signal(signal.SIGINT)
+        return original(self)
+
+    monkeypatch.setattr(Trainer, "iterate", interrupted)
+    with pytest.raises(SystemExit) as exit_info:
+        main([*ARGUMENTS, "--total-steps", "128", "--output", str(tmp_path), "--name", "run"])
+    assert exit_info.value.code == 130 and f"continue with --resume {tmp_path / 'run'}" in capsys.readouterr().err
+    assert torch.load(tmp_path / "run" / STATE_FILE, weights_only=True)["steps"] == 64
+    Controller.load(tmp_path / "run" / "controller")
 
 
 def test_killed_run_resumes_from_its_last_save(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "lowlevel.train", *ARGUMENTS, "--output", str(tmp_path), "--name", "run"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
     state = tmp_path / "run" / STATE_FILE
-    deadline = time.monotonic() + 60
-    while not state.exists() and time.monotonic() < deadline:
+    deadline = time.monotonic() + 300
+    while not state.exists():
+        assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.05)
     time.sleep(0.3)
     process.send_signal(signal.SIGKILL)
@@ -124,6 +144,7 @@ def test_killed_run_resumes_from_its_last_save(tmp_path: Path) -> None:
     [
         (["--preset", "stairs"], "unknown preset 'stairs'"),
         (["--resume", "/nonexistent"], "/nonexistent holds no run.json"),
+        (["--resume", "/nonexistent", "--preset", "flat"], "leave --preset out"),
         (["--warm-start", "/nonexistent"], "/nonexistent holds no training_state.pt"),
         (["--output", "/proc/nowhere"], "/proc/nowhere"),
         (["--environment.gains", "rubber"], "unknown gain set 'rubber'"),
@@ -134,6 +155,37 @@ def test_bad_input_gives_one_sentence(arguments: list[str], message: str, tmp_pa
     with pytest.raises(SystemExit) as exit_info:
         main([*arguments, *output])
     assert message in str(exit_info.value) and "\n" not in str(exit_info.value)
+
+
+@pytest.mark.parametrize("command", ["--resume", "--warm-start"])
+def test_a_state_that_cannot_be_used_is_refused_and_left_alone(command: str, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    trainer = Trainer(tiny(), folder)
+    path = trainer.save()
+    write_run_description(folder, describe_run(tiny(), preset="flat"))
+    content, state = path.read_bytes(), trainer.state_dict()
+
+    def refusal() -> str:
+        before = path.read_bytes()
+        network = ["--network.history-hidden", "16", "--network.map-hidden", "8", "--network.map-global", "4"]
+        network += ["--network.expert-hidden", "16", "8", "--network.critic-hidden", "16"]
+        network += ["--network.target-hidden", "16", f"--output={tmp_path / 'new'}", *ARGUMENTS]
+        with pytest.raises(SystemExit) as exit_info:
+            main([command, str(folder), *(network if command == "--warm-start" else [])])
+        assert path.read_bytes() == before and not (tmp_path / "new").exists()
+        return str(exit_info.value)
+
+    for length in (0, 5000):
+        path.write_bytes(content[:length])
+        assert "is not a readable training state" in refusal()
+    torch.save({name: value for name, value in state.items() if name != "curriculum"}, path)
+    assert "has no 'curriculum'" in refusal()
+    torch.save(state, path)
+    bias = next(name for name in state["ppo"]["actor"] if name.endswith("bias"))
+    state["ppo"]["actor"][bias].view(-1)[0] = torch.nan
+    torch.save(state, path)
+    assert f"weight {bias!r}" in refusal() and "is not finite" in refusal()
 
 
 def test_truncated_training_state_is_refused_and_left_alone(tmp_path: Path) -> None:
