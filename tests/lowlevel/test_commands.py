@@ -59,6 +59,14 @@ def test_shares_of_the_mixture(space: CommandSpace) -> None:
     assert (~walks).float().mean().item() == pytest.approx(0.4, abs=0.04)
 
 
+def test_the_stand_share_stands_in_the_neutral_posture(space: CommandSpace) -> None:
+    sampler = CommandSampler(space, CommandMixture(walk_and_work=0.3, stand_and_work=0.3, stand=0.3))
+    command, flag = sampler.sample(4000, CommandRange(), torch.Generator().manual_seed(0))
+    neutral = (command == space.neutral()).all(dim=1)
+    assert neutral.float().mean().item() == pytest.approx(0.3, abs=0.03)
+    assert not flag[neutral].any()
+
+
 def test_walking_commands_keep_to_the_walking_posture(space: CommandSpace) -> None:
     command, flag = draw(space, CommandRange())
     walking = command[is_walking(command)]
