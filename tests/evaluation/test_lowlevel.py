@@ -353,7 +353,7 @@ def test_interrupting_leaves_nothing_behind(untrained_controller: Path, tmp_path
     assert process.stdout is not None
     assert "evaluating" in process.stdout.readline()
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=20.0)
+    _, errors = process.communicate(timeout=60.0)
     assert process.returncode != 0
     assert errors.strip() == "evaluate-lowlevel: interrupted, nothing was written"
     assert list(tmp_path.iterdir()) == []
