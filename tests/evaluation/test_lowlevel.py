@@ -349,6 +349,8 @@ def test_interrupting_leaves_nothing_behind(untrained_controller: Path, tmp_path
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
+        # A shell starts its background jobs, and so their children, with the interrupt ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert process.stdout is not None
     assert "evaluating" in process.stdout.readline()
