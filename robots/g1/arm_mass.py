@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from robots.g1.constants import ARM_JOINTS, JOINT_NAMES
+from robots.g1.constants import ARM_JOINTS
 from robots.g1.kinematics import build_model
 
 _ARM_LENGTH = 7
@@ -32,7 +32,8 @@ class ArmMass:
         rotations = np.array([[model.jointPlacements[j].rotation for j in arm] for arm in joints])
         offsets = np.array([[model.jointPlacements[j].translation for j in arm] for arm in joints])
         outboard = np.cumsum(masses[:, ::-1], axis=1)[:, ::-1]
-        self._axes = [_axis(JOINT_NAMES[ARM_JOINTS.start + k]) for k in range(_ARM_LENGTH)]
+        # Pinocchio names a joint model after the axis it turns about: JointModelRX, RY or RZ.
+        self._axes = ["XYZ".index(model.joints[j].shortname()[-1]) for j in joints[0]]
 
         def tensor(array: np.ndarray) -> Tensor:
             return torch.tensor(array, dtype=torch.float32, device=device)
@@ -49,11 +50,6 @@ class ArmMass:
             moment = _rotate(moment + self._moments[:, k], self._axes[k], sine[..., k], cosine[..., k])
             moment = torch.einsum("aij,naj->nai", self._rotations[:, k], moment) + self._carried[:, k]
         return moment.sum(dim=1)
-
-
-def _axis(name: str) -> int:
-    """Index of the coordinate axis a G1 joint turns about; they are named after it."""
-    return ("roll", "pitch", "yaw").index(name.split("_")[-2]) if "elbow" not in name else 1
 
 
 def _rotate(vectors: Tensor, axis: int, sine: Tensor, cosine: Tensor) -> Tensor:
