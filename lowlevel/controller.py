@@ -43,7 +43,7 @@ from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
     "controller.json",
     "weights.safetensors",
@@ -91,6 +91,8 @@ class _Memory:
     nominal: NominalState
     action: Tensor
     history: Tensor
+    unbalance: Tensor
+    """As :meth:`NominalMotion.joint_targets` found it last (N,) [rad]."""
     is_fresh: Tensor
     """Robots that have not acted since their reset: their history starts with the next frame."""
 
@@ -131,6 +133,7 @@ class Controller:
                 nominal=self.motion.initial_state(neutral),
                 action=torch.zeros(num_robots, NUM_JOINTS, device=self.device),
                 history=torch.zeros(num_robots, HISTORY_LENGTH + 1, FRAME_SIZE, device=self.device),
+                unbalance=torch.zeros(num_robots, device=self.device),
                 is_fresh=torch.ones(num_robots, dtype=torch.bool, device=self.device),
             )
             return
@@ -138,6 +141,8 @@ class Controller:
         memory.nominal.reference[ids] = self.config.command_space.neutral(self.device)
         memory.nominal.phase[ids] = 0.0
         memory.nominal.walking[ids] = 0.0
+        memory.nominal.stepping[ids] = 0.0
+        memory.unbalance[ids] = 0.0
         memory.action[ids] = 0.0
         memory.is_fresh[ids] = True
 
@@ -158,7 +163,7 @@ class Controller:
         if memory is None or len(memory.action) != len(command):
             raise RuntimeError(f"call reset({len(command)}) before act() with {len(command)} robots")
         command = self.motion.clamp(command)
-        memory.nominal = self.motion.advance(memory.nominal, command)
+        memory.nominal = self.motion.advance(memory.nominal, command, memory.unbalance)
         frame = self._build_frame(
             proprioception.joint_position,
             proprioception.joint_velocity,
@@ -176,7 +181,7 @@ class Controller:
         self.gate = output.gate
         limit = self.config.action_limit
         memory.action = output.mean.clamp(-limit, limit)
-        nominal = self.motion.joint_targets(
+        nominal, memory.unbalance = self.motion.joint_targets(
             memory.nominal, proprioception.projected_gravity, proprioception.base_angular_velocity
         )
         return nominal + memory.action * self.action_scale

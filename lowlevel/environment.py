@@ -90,6 +90,8 @@ class Buffers:
     reference: Tensor
     phase: Tensor
     walking: Tensor
+    stepping: Tensor
+    unbalance: Tensor
     history: Tensor
     elevation: Tensor
     foot_air_time: Tensor
@@ -174,6 +176,8 @@ class PilotEnvironment:
             reference=neutral.clone(),
             phase=zeros(),
             walking=zeros(),
+            stepping=zeros(),
+            unbalance=zeros(),
             history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
             elevation=zeros(MAP_SIZE),
             foot_air_time=zeros(2),
@@ -204,7 +208,7 @@ class PilotEnvironment:
         buffers = self.buffers
         action = action.clamp(-self.config.action_limit, self.config.action_limit)
         frame = split_frame(buffers.history[:, -1])
-        nominal_target = self.motion.joint_targets(
+        nominal_target, buffers.unbalance = self.motion.joint_targets(
             self._nominal_state(), frame["projected_gravity"], frame["base_angular_velocity"]
         )
         target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
@@ -266,15 +270,14 @@ class PilotEnvironment:
     # -- parts of a step --------------------------------------------------------------------------------------
 
     def _nominal_state(self) -> NominalState:
-        return NominalState(self.buffers.reference, self.buffers.phase, self.buffers.walking)
+        buffers = self.buffers
+        return NominalState(buffers.reference, buffers.phase, buffers.walking, buffers.stepping)
 
     def _advance_nominal(self) -> None:
-        state = self.motion.advance(self._nominal_state(), self.buffers.command)
-        self.buffers.reference, self.buffers.phase, self.buffers.walking = (
-            state.reference,
-            state.phase,
-            state.walking,
-        )
+        buffers = self.buffers
+        state = self.motion.advance(self._nominal_state(), buffers.command, buffers.unbalance)
+        buffers.reference, buffers.phase = state.reference, state.phase
+        buffers.walking, buffers.stepping = state.walking, state.stepping
 
     def _update_foot_times(self, measured: Measurement) -> None:
         contact, period = measured.foot_contact, self.control_period
@@ -301,6 +304,7 @@ class PilotEnvironment:
         reference = torch.where(in_posture, buffers.command[ids], neutral).clone()
         reference[:, VELOCITY] = 0.0
         buffers.reference[ids], buffers.phase[ids], buffers.walking[ids] = reference, 0.0, 0.0
+        buffers.stepping[ids], buffers.unbalance[ids] = 0.0, 0.0
 
         heading = self._uniform(-torch.pi, torch.pi, count)
         facing = from_roll_pitch_yaw(heading[:, None] * torch.tensor([0.0, 0.0, 1.0], device=self.device))

@@ -50,6 +50,8 @@ class NominalConfig:
     """Show the gait clock to the policy (sine and cosine, zero while standing); an addition to the paper."""
     gait_frequency: float = 2.0
     """Steps of one foot per second [Hz]."""
+    velocity_rate: float = 1.0
+    """Slew rate of the velocity reference [m/s^2] and [rad/s^2]: steps go on until the robot has slowed down."""
     height_rate: float = 0.25
     """Slew rate of the base height reference [m/s]."""
     torso_rate: float = 1.0
@@ -83,6 +85,12 @@ class NominalConfig:
     chase it carry the robot along."""
     largest_lean: float = 0.2
     """Largest lean along x and along y [rad]."""
+    stepping_threshold: float = 0.22
+    """Unbalance (:meth:`NominalMotion.joint_targets`) from which a standing robot marches to catch itself [rad]."""
+    stepping_time: float = 0.8
+    """How long it then marches [s]."""
+    stepping_height: float = 0.55
+    """Lowest base height reference at which it does: a deep squat leaves the legs no room [m]."""
 
 
 @dataclass
@@ -90,11 +98,13 @@ class NominalState:
     """State of the reference filter and gait clock; one row per robot."""
 
     reference: Tensor
-    """Slewed command (N, 21); its velocity part is the command itself."""
+    """Slewed command (N, 21)."""
     phase: Tensor
     """Gait phase (N,) [rad]; the left foot swings in (0, pi), the right one in (pi, 2 pi)."""
     walking: Tensor
     """Fade-in of the march (N,) in [0, 1]."""
+    stepping: Tensor
+    """Time for which a robot told to stand still marches to catch itself (N,) [s]."""
 
 
 class NominalMotion:
@@ -116,7 +126,8 @@ class NominalMotion:
         stiffness = torch.tensor(gains.stiffness[LOWER_JOINTS], dtype=torch.float32, device=device)
         self._inverse_stiffness = 1.0 / stiffness
         rate = torch.full((COMMAND_SIZE,), math.inf, device=device)
-        rate[HEIGHT], rate[TORSO], rate[ARMS] = config.height_rate, config.torso_rate, config.arm_rate
+        rate[VELOCITY], rate[HEIGHT] = config.velocity_rate, config.height_rate
+        rate[TORSO], rate[ARMS] = config.torso_rate, config.arm_rate
         self.arm_mass = ArmMass(device)
         self._default_moment = self.arm_mass.first_moment(self.default[None, ARM_JOINTS])
         self._unit = torch.eye(3, device=device)
@@ -127,7 +138,7 @@ class NominalMotion:
         """References at their goal, phase zero, standing."""
         count = len(command)
         zeros = torch.zeros(count, device=command.device)
-        return NominalState(command.clone(), zeros, zeros.clone())
+        return NominalState(command.clone(), zeros, zeros.clone(), zeros.clone())
 
     def clamp(self, command: Tensor) -> Tensor:
         """Move the posture of ``command`` (N, 21) into the feasible region; everything else is unchanged."""
@@ -135,16 +146,26 @@ class NominalMotion:
         clamped[:, POSTURE] = self.pose.clamp(command[:, POSTURE])
         return clamped
 
-    def advance(self, state: NominalState, command: Tensor) -> NominalState:
-        """One control step of reference filter and gait clock towards ``command`` (N, 21)."""
+    def advance(self, state: NominalState, command: Tensor, unbalance: Tensor) -> NominalState:
+        """One control step of reference filter and gait clock towards ``command`` (N, 21).
+
+        ``unbalance`` (N,) [rad]: as the last :meth:`joint_targets` found it.
+        """
         change = (command - state.reference).clamp(-self._largest_change, self._largest_change)
-        walks = is_walking(command)
+        reference = state.reference + change
+        # A march sways by as much, so only one that fades out starts anew; so does a move to another posture.
+        loses_balance = (unbalance > self.config.stepping_threshold) & (state.walking <= 0.5)
+        rests = (reference[:, POSTURE] == command[:, POSTURE]).all(dim=1)
+        steps = loses_balance & rests & (reference[:, HEIGHT] >= self.config.stepping_height)
+        remaining = (state.stepping - self.control_period).clamp_min(0.0)
+        stepping = torch.where(steps, self.config.stepping_time, remaining)
+        walks = is_walking(command) | is_walking(reference) | (stepping > 0.0)
         fade = self.control_period / self.config.walking_ramp
         walking = (state.walking + torch.where(walks, fade, -fade)).clamp(0.0, 1.0)
         step = 2.0 * math.pi * self.config.gait_frequency * self.control_period
         moves = walking > 0.0
         phase = torch.where(moves, (state.phase + step) % (2.0 * math.pi), torch.zeros_like(state.phase))
-        return NominalState(state.reference + change, phase, walking)
+        return NominalState(reference, phase, walking, stepping)
 
     def clock(self, state: NominalState) -> Tensor:
         """Gait clock as the policy sees it (N, 2): sine and cosine of the phase, faded out at rest."""
@@ -164,8 +185,13 @@ class NominalMotion:
         pitched = from_roll_pitch_yaw(torch.stack([zero, pitch, zero], -1))
         return multiply(from_roll_pitch_yaw(torso), conjugate(multiply(yawed, multiply(rolled, pitched))))
 
-    def joint_targets(self, state: NominalState, projected_gravity: Tensor, base_angular_velocity: Tensor) -> Tensor:
-        """Nominal PD targets (N, 29) [rad], gravity compensated by the table's static torques.
+    def joint_targets(
+        self, state: NominalState, projected_gravity: Tensor, base_angular_velocity: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Nominal PD targets (N, 29) [rad], gravity compensated by the table's static torques, and unbalance (N,).
+
+        Unbalance [rad] is the tilt off the nominal attitude plus ``step_damping`` times the tilt rate: where the body
+        is heading. It is zero without the balance strategy.
 
         They may lie beyond the joint limits: a joint that rests at its limit needs such a target to push against it.
 
@@ -173,8 +199,9 @@ class NominalMotion:
         """
         targets = self.default.expand(len(state.phase), NUM_JOINTS).clone()
         targets[:, ARM_JOINTS] = state.reference[:, ARMS]
+        unbalance = torch.zeros_like(state.phase)
         if self.config.kind == "default":
-            return targets
+            return targets, unbalance
         position, torque, shift = self.pose.lookup(state.reference[:, POSTURE])
         if self.config.carry_arms:
             position, torque = self._carry_arms(state.reference, position, torque, shift)
@@ -183,8 +210,8 @@ class NominalMotion:
             self._add_march(targets, state)
         if self.config.balance_stiffness > 0.0:
             attitude = self.pelvis_attitude(state.reference[:, TORSO], position[:, WAIST_JOINTS])
-            self._add_balance(targets, state, attitude, projected_gravity, base_angular_velocity)
-        return targets
+            unbalance = self._add_balance(targets, state, attitude, projected_gravity, base_angular_velocity)
+        return targets, unbalance
 
     def _carry_arms(self, reference: Tensor, position: Tensor, torque: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Positions and gravity torques (N, 15) for arms that are not at their default, as the table assumes.
@@ -242,7 +269,7 @@ class NominalMotion:
         attitude: Tensor,
         gravity: Tensor,
         angular_velocity: Tensor,
-    ) -> None:
+    ) -> Tensor:
         """Lean against the pelvis' tilt off its nominal ``attitude`` with the ankles and, marching, with steps.
 
         The capture point of a falling pendulum lies in the direction of tilt + rate * sqrt(height / g) (Pratt et al.,
@@ -265,3 +292,4 @@ class NominalMotion:
             for axis, direction in ((0, "roll"), (1, "pitch")):
                 targets[:, joint_index(f"{side}_ankle_{direction}_joint")] += ankle[:, axis]
                 targets[:, joint_index(f"{side}_hip_{direction}_joint")] -= sign * swing * capture[:, axis]
+        return (tilt + config.step_damping * angular_velocity)[:, :2].norm(dim=-1)

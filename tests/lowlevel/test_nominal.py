@@ -25,6 +25,7 @@ from robots.g1.model import build_spec, joint_limits
 LIMITS = joint_limits(build_spec().compile())
 UPRIGHT = torch.tensor([[0.0, 0.0, -1.0]])
 STILL = torch.zeros(1, 3)
+BALANCED = torch.zeros(1)
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +44,13 @@ def test_references_slew_at_their_rates_and_arrive(space: CommandSpace) -> None:
     command = start.clone()
     command[:, HEIGHT], command[:, TORSO.start + 1], command[:, ARMS.start] = 0.5, 0.6, 1.1
     state = nominal.initial_state(start)
-    state = nominal.advance(state, command)
+    state = nominal.advance(state, command, BALANCED)
     change = state.reference - start
     assert change[0, HEIGHT].item() == pytest.approx(-0.25 * 0.02)
     assert change[0, TORSO.start + 1].item() == pytest.approx(1.0 * 0.02)
     assert change[0, ARMS.start].item() == pytest.approx(4.0 * 0.02)
     for _ in range(60):
-        state = nominal.advance(state, command)
+        state = nominal.advance(state, command, BALANCED)
     assert torch.allclose(state.reference, command)
 
 
@@ -59,13 +60,38 @@ def test_clock_runs_while_walking_and_rests_while_standing(space: CommandSpace) 
     walk[:, VELOCITY.start] = 0.5
     state = nominal.initial_state(stand)
     for _ in range(50):
-        state = nominal.advance(state, walk)
+        state = nominal.advance(state, walk, BALANCED)
     assert state.walking.item() == 1.0
     assert np.cos(state.phase.item()) == pytest.approx(1.0, abs=1e-5)  # two whole periods in one second
     assert nominal.clock(state).norm().item() == pytest.approx(1.0)
+    for _ in range(19):  # slowing down from 0.5 m/s at 1 m/s^2
+        assert state.walking.item() == 1.0
+        state = nominal.advance(state, stand, BALANCED)
     for _ in range(20):
-        state = nominal.advance(state, stand)
+        state = nominal.advance(state, stand, BALANCED)
     assert state.phase.item() == 0.0 and not nominal.clock(state).any()
+
+
+def test_a_robot_that_tips_over_marches_for_a_while(space: CommandSpace) -> None:
+    nominal = motion()
+    stand = space.neutral()[None]
+    spinning = torch.tensor([[0.0, 1.0, 0.0]])
+    state = nominal.initial_state(stand)
+    unbalance = nominal.joint_targets(state, UPRIGHT, spinning)[1]
+    assert unbalance.item() == pytest.approx(nominal.config.step_damping, abs=0.02)
+    state = nominal.advance(state, stand, unbalance)
+    marched = 0
+    while state.walking.item() > 0.0:
+        marched += 1
+        state = nominal.advance(state, stand, BALANCED)
+    assert marched * 0.02 == pytest.approx(nominal.config.stepping_time + nominal.config.walking_ramp, abs=0.05)
+
+
+def test_a_robot_in_a_deep_squat_does_not_march(space: CommandSpace) -> None:
+    nominal = motion()
+    squat = space.neutral()[None].clone()
+    squat[:, HEIGHT] = 0.4
+    assert nominal.advance(nominal.initial_state(squat), squat, torch.ones(1)).walking.item() == 0.0
 
 
 def test_arms_follow_the_reference_in_every_kind(space: CommandSpace) -> None:
@@ -73,10 +99,10 @@ def test_arms_follow_the_reference_in_every_kind(space: CommandSpace) -> None:
     command[:, ARMS] += 0.1
     for kind in ("default", "pose", "march"):
         nominal = motion(kind=kind)
-        targets = nominal.joint_targets(nominal.initial_state(command), UPRIGHT, STILL)
+        targets = nominal.joint_targets(nominal.initial_state(command), UPRIGHT, STILL)[0]
         assert torch.allclose(targets[:, ARM_JOINTS], command[:, ARMS])
     default = motion(kind="default")
-    legs = default.joint_targets(default.initial_state(command), UPRIGHT, STILL)[0, :15]
+    legs = default.joint_targets(default.initial_state(command), UPRIGHT, STILL)[0][0, :15]
     assert torch.allclose(legs, torch.tensor(DEFAULT_POSITION[:15], dtype=torch.float32))
 
 
@@ -88,18 +114,18 @@ def test_march_half_a_period_later_is_the_mirror_image(space: CommandSpace) -> N
     state.walking[:] = 1.0
     for phase in (0.4, 1.3, 2.9):
         state.phase[:] = phase
-        now = nominal.joint_targets(state, UPRIGHT, STILL)
+        now = nominal.joint_targets(state, UPRIGHT, STILL)[0]
         state.phase[:] = phase + np.pi
-        later = nominal.joint_targets(state, UPRIGHT, STILL)
+        later = nominal.joint_targets(state, UPRIGHT, STILL)[0]
         assert np.allclose(JOINTS_MIRROR(now.numpy()), later.numpy(), atol=2e-3)
 
 
 def test_march_lifts_the_swing_leg_only(space: CommandSpace) -> None:
     nominal = motion()
     state = nominal.initial_state(space.neutral()[None])
-    rest = nominal.joint_targets(state, UPRIGHT, STILL)
+    rest = nominal.joint_targets(state, UPRIGHT, STILL)[0]
     state.walking[:], state.phase[:] = 1.0, np.pi / 2
-    lifted = nominal.joint_targets(state, UPRIGHT, STILL) - rest
+    lifted = nominal.joint_targets(state, UPRIGHT, STILL)[0] - rest
     assert lifted[0, joint_index("left_knee_joint")].item() == pytest.approx(0.8, abs=1e-5)
     assert lifted[0, joint_index("right_knee_joint")].item() == pytest.approx(0.0, abs=1e-6)
 
@@ -112,10 +138,10 @@ def test_ankles_push_against_tilt_and_vanish_at_the_nominal_attitude(space: Comm
     )
     rotation = pin.Quaternion(*attitude[0].double().tolist()).toRotationMatrix()
     nominal_gravity = torch.tensor(rotation.T @ np.array([0, 0, -1.0]), dtype=torch.float32)[None]
-    base = without.joint_targets(state, nominal_gravity, STILL)
-    assert torch.allclose(nominal.joint_targets(state, nominal_gravity, STILL), base, atol=1e-6)
+    base = without.joint_targets(state, nominal_gravity, STILL)[0]
+    assert torch.allclose(nominal.joint_targets(state, nominal_gravity, STILL)[0], base, atol=1e-6)
     forwards = torch.tensor([[np.sin(0.1), 0.0, -np.cos(0.1)]], dtype=torch.float32)
-    leaning = nominal.joint_targets(state, forwards, STILL) - base
+    leaning = nominal.joint_targets(state, forwards, STILL)[0] - base
     assert leaning[0, joint_index("left_ankle_pitch_joint")] > 0.1  # toes down pushes the body back
 
 
@@ -135,7 +161,7 @@ def test_the_pelvis_gives_way_to_outstretched_arms(space: CommandSpace) -> None:
         torque_free = replace(GAINS["stiff"], stiffness=np.full(29, np.inf))
         nominal = NominalMotion(nominal.config, torque_free, control_period=0.02)
         q = pin.neutral(model)
-        q[7:] = nominal.joint_targets(state, UPRIGHT, STILL)[0].double().numpy()
+        q[7:] = nominal.joint_targets(state, UPRIGHT, STILL)[0][0].double().numpy()
         pin.framesForwardKinematics(model, data, q)
         feet = [data.oMf[model.getFrameId(name)].translation for name in FOOT_BODIES]
         return pin.centerOfMass(model, data, q)[:2] - np.mean(feet, axis=0)[:2]
