@@ -64,7 +64,7 @@ class NominalConfig:
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
     lateral_shift: float = 0.05
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
-    stride: tuple[float, float, float] = (0.28, 0.15, 0.11)
+    stride: tuple[float, float, float] = (0.16, 0.13, 0.17)
     """Hip swing per commanded vx, vy [rad per m/s] and yaw rate [rad per rad/s]. A foot that lands half a step ahead
     of the hip keeps the speed; one further ahead brakes."""
     carry_arms: bool = True
@@ -80,10 +80,10 @@ class NominalConfig:
     rights the body."""
     step_damping: float = 0.27
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
-    lean: tuple[float, float] = (0.3, 0.55)
+    lean: tuple[float, float] = (0.27, 0.58)
     """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
     chase it carry the robot along."""
-    largest_lean: float = 0.2
+    largest_lean: float = 0.33
     """Largest lean along x and along y [rad]."""
     stepping_threshold: float = 0.22
     """Unbalance (:meth:`NominalMotion.joint_targets`) from which a standing robot marches to catch itself [rad]."""
@@ -91,6 +91,8 @@ class NominalConfig:
     """How long it then marches [s]."""
     stepping_height: float = 0.55
     """Lowest base height reference at which it does: a deep squat leaves the legs no room [m]."""
+    stepping_torso: tuple[float, float, float] = (0.2, 0.5, 0.5)
+    """Largest torso roll, pitch and yaw references at which it does [rad]."""
 
 
 @dataclass
@@ -131,6 +133,7 @@ class NominalMotion:
         self.arm_mass = ArmMass(device)
         self._default_moment = self.arm_mass.first_moment(self.default[None, ARM_JOINTS])
         self._unit = torch.eye(3, device=device)
+        self._stepping_torso = torch.tensor(config.stepping_torso, device=device)
         self._stride = torch.tensor(config.stride, device=device)
         self._largest_change = rate * control_period
 
@@ -156,7 +159,9 @@ class NominalMotion:
         # A march sways by as much, so only one that fades out starts anew; so does a move to another posture.
         loses_balance = (unbalance > self.config.stepping_threshold) & (state.walking <= 0.5)
         rests = (reference[:, POSTURE] == command[:, POSTURE]).all(dim=1)
-        steps = loses_balance & rests & (reference[:, HEIGHT] >= self.config.stepping_height)
+        is_upright = (reference[:, TORSO].abs() <= self._stepping_torso).all(dim=1)
+        is_tall = reference[:, HEIGHT] >= self.config.stepping_height
+        steps = loses_balance & rests & is_upright & is_tall
         remaining = (state.stepping - self.control_period).clamp_min(0.0)
         stepping = torch.where(steps, self.config.stepping_time, remaining)
         walks = is_walking(command) | is_walking(reference) | (stepping > 0.0)
