@@ -265,7 +265,14 @@ class Controller:
         return cls(config, actor, pose, description["provenance"], device)
 
     def save(self, folder: Path | str, golden_seed: int = 0) -> None:
-        """Write the folder: JSON, weights, ONNX and golden vectors; each file is complete or absent."""
+        """Write the folder: JSON, weights, ONNX and golden vectors; each file is complete or absent.
+
+        Raises:
+            ControllerError: if a weight is not finite; nothing is written then.
+        """
+        for name, tensor in self.actor.state_dict().items():
+            if not torch.isfinite(tensor).all():
+                raise ControllerError(f"weight {name!r} is not finite: nothing was written to {folder}")
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         pose = {f"nominal_pose.{name}": getattr(self.motion.pose, name).cpu() for name in _POSE_TENSORS}

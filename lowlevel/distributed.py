@@ -23,9 +23,12 @@ def start(device: str = "cpu") -> torch.device:
     NCCL, one GPU per local rank, and CPU tensors over gloo.
 
     Raises:
-        ValueError: if ``WORLD_SIZE`` is not an integer, or a CUDA device is asked for and there is none.
+        ValueError: if ``WORLD_SIZE`` is not an integer, or ``device`` is unknown or not there.
     """
-    chosen = torch.device(device)
+    try:
+        chosen = torch.device(device)
+    except RuntimeError as error:
+        raise ValueError(f"unknown device {device!r}; use 'cpu' or 'cuda'") from error
     if chosen.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("a CUDA device was asked for but PyTorch finds none; use device 'cpu'")
     announced = os.environ.get("WORLD_SIZE", "1")

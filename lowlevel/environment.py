@@ -132,6 +132,9 @@ class PilotEnvironment:
             raise ValueError(
                 f"timestep {config.timestep} s times decimation {config.decimation} is not the control period 0.02 s"
             )
+        for name in ("num_robots", "num_threads"):
+            if getattr(config, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(config, name)}")
         self.config = config
         self.device = torch.device(device)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -13,6 +14,7 @@ def stop_on_signals(request_stop: Callable[[], None]) -> Iterator[None]:
     """Call ``request_stop`` on Ctrl-C and SIGTERM inside the context; the handlers of before return after it."""
 
     def handle(number: int, frame: FrameType | None) -> None:
+        print("stopping at the next safe point", file=sys.stderr, flush=True)
         request_stop()
 
     previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -84,6 +84,9 @@ class PPOConfig:
     """Weights of the estimator loss."""
 
     def __post_init__(self) -> None:
+        for name in ("steps_per_update", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0 < self.estimator_epochs <= self.epochs:
             raise ValueError(f"estimator_epochs {self.estimator_epochs} is not between 1 and epochs {self.epochs}")
         if self.symmetry not in ("none", "augmentation", "loss"):

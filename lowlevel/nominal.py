@@ -60,11 +60,11 @@ class NominalConfig:
     """Slew rate of the arm reference [rad/s]."""
     walking_ramp: float = 0.3
     """Time over which the march fades in and out [s]."""
-    knee_lift: float = 0.8
+    knee_lift: float = 0.76
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
-    lateral_shift: float = 0.05
+    lateral_shift: float = 0.035
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
-    stride: tuple[float, float, float] = (0.16, 0.13, 0.17)
+    stride: tuple[float, float, float] = (0.1, 0.14, 0.18)
     """Hip swing per commanded vx, vy [rad per m/s] and yaw rate [rad per rad/s]. A foot that lands half a step ahead
     of the hip keeps the speed; one further ahead brakes."""
     carry_arms: bool = True
@@ -80,7 +80,7 @@ class NominalConfig:
     rights the body."""
     step_damping: float = 0.27
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
-    lean: tuple[float, float] = (0.27, 0.58)
+    lean: tuple[float, float] = (0.25, 0.5)
     """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
     chase it carry the robot along."""
     largest_lean: float = 0.33

@@ -136,7 +136,7 @@ class Trainer:
                 if time.monotonic() - last_save > self.config.save_interval:
                     self.save()
                     last_save = time.monotonic()
-        self.save()
+            self.save()
 
     @property
     def _steps_per_iteration(self) -> int:
@@ -211,7 +211,10 @@ class Trainer:
         try:
             self.ppo.load_state_dict(state["ppo"])
         except (KeyError, RuntimeError, ValueError) as error:
-            raise ValueError(f"the training state belongs to other networks: {error}") from error
+            # torch lists every difference in a line of its own
+            first, *others = [line.strip() for line in str(error).splitlines() if not line.endswith("):")] or [error]
+            more = f" (and {len(others)} more)" if others else ""
+            raise ValueError(f"the training state belongs to other networks: {first}{more}") from error
         self.curriculum.load_state_dict(state["curriculum"])
         self.environment.open_range = self.curriculum.open_range
         self.fall_rate = float(state["fall_rate"])

@@ -143,6 +143,14 @@ def test_weights_that_are_not_finite_are_refused_by_name(copy: Path) -> None:
     assert "'head.first.weight'" in refused(copy)
 
 
+def test_a_controller_that_is_not_finite_is_not_saved(folder: Path, tmp_path: Path) -> None:
+    controller = Controller.load(folder)
+    controller.actor.head.output_weight.data[0] = float("inf")
+    with pytest.raises(ControllerError, match=r"'head\.output_weight' is not finite"):
+        controller.save(tmp_path / "broken")
+    assert not (tmp_path / "broken").exists()
+
+
 def test_weights_of_another_network_are_refused(copy: Path) -> None:
     tensors = load_file(copy / WEIGHTS_FILE)
     tensors["head.first.weight"] = tensors["head.first.weight"][:, :-1].contiguous()

@@ -71,8 +71,11 @@ atomic_write(Path(sys.argv[1]), write)
         assert process.stdout.readline().strip() == b"writing"
         process.send_signal(signal.SIGKILL)
     assert path.read_bytes() == b"old"
+    atomic_write(path, lambda file: file.write(b"new"))
+    assert [entry.name for entry in tmp_path.iterdir()] == ["state"] and path.read_bytes() == b"new"
 
 
-def test_files_are_readable_by_others(tmp_path: Path) -> None:
+def test_files_have_the_permissions_of_any_new_file(tmp_path: Path) -> None:
+    (tmp_path / "plain").write_bytes(b"x")
     atomic_write(tmp_path / "shared", lambda file: file.write(b"x"))
-    assert (tmp_path / "shared").stat().st_mode & 0o777 == 0o644
+    assert (tmp_path / "shared").stat().st_mode == (tmp_path / "plain").stat().st_mode

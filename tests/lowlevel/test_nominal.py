@@ -126,7 +126,7 @@ def test_march_lifts_the_swing_leg_only(space: CommandSpace) -> None:
     rest = nominal.joint_targets(state, UPRIGHT, STILL)[0]
     state.walking[:], state.phase[:] = 1.0, np.pi / 2
     lifted = nominal.joint_targets(state, UPRIGHT, STILL)[0] - rest
-    assert lifted[0, joint_index("left_knee_joint")].item() == pytest.approx(0.8, abs=1e-5)
+    assert lifted[0, joint_index("left_knee_joint")].item() == pytest.approx(nominal.config.knee_lift, abs=1e-5)
     assert lifted[0, joint_index("right_knee_joint")].item() == pytest.approx(0.0, abs=1e-6)
 
 

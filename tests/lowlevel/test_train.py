@@ -148,6 +148,8 @@ def test_killed_run_resumes_from_its_last_save(tmp_path: Path) -> None:
         (["--warm-start", "/nonexistent"], "/nonexistent holds no training_state.pt"),
         (["--output", "/proc/nowhere"], "/proc/nowhere"),
         (["--environment.gains", "rubber"], "unknown gain set 'rubber'"),
+        (["--environment.num-robots", "0"], "num_robots must be at least 1"),
+        (["--device", "abacus"], "unknown device 'abacus'"),
     ],
 )
 def test_bad_input_gives_one_sentence(arguments: list[str], message: str, tmp_path: Path) -> None:
