@@ -85,22 +85,26 @@ class ExpertConfig:
     """Of the palms from their pre-grasp places before they close [m]."""
     close_speed: float = 0.16
     """Of each palm towards its face [m/s]."""
-    force: float = 30.0
+    force: float = 36.0
     """Wanted normal force per palm [N]."""
     force_gain: float = 0.0016
     """Squeeze depth per force error and decision [m/N]."""
-    deepest: float = 0.08
+    deepest: float = 0.095
     """Largest squeeze depth [m]."""
-    grasp_time: float = 0.5
+    grasp_time: float = 0.3
     """Time with both palms loaded before the lift [s]."""
-    lift_time: float = 2.6
+    lift_time: float = 2.2
     """[s]"""
-    carry_ahead: float = 0.37
+    carry_ahead: float = 0.34
     """Of the palms from the feet when upright [m]."""
     carry_height: float = 0.74
     """Least height of the palms when upright [m]."""
     carry_clearance: float = 0.38
     """Least bottom of the box above its support when upright [m]."""
+    raise_gain: float = 0.08
+    """Share of the missing clearance that the palms rise by at every decision once upright; the arms give way."""
+    largest_raise: float = 0.2
+    """[m]"""
     stand_height: float = 0.75
     """[m]"""
     pitch_filter: float = 0.2
@@ -132,6 +136,8 @@ class _Memory:
     """Yaw of the box when the lift began (N,) [rad]."""
     pitch_error: Tensor
     """Torso pitch measured - commanded, filtered (N,) [rad]."""
+    raised: Tensor
+    """Added to the palms' height once upright (N,) [m]."""
     level: Tensor
     """Added to the pitch of the fingers to level the box (N,) [rad]."""
     loaded_time: Tensor
@@ -165,6 +171,7 @@ class LiftBoxExpert:
             grasp_point=torch.zeros(count, 3),
             grasp_yaw=torch.zeros(count),
             pitch_error=torch.zeros(count),
+            raised=torch.zeros(count),
             level=torch.zeros(count),
             loaded_time=torch.zeros(count),
             arms=torch.zeros(count, 14),
@@ -316,7 +323,7 @@ class LiftBoxExpert:
         feet = robot.foot_position.mean(dim=1)
         carry = feet + (config.carry_ahead - 0.035) * forward
         carry_height = episode.support_height + config.carry_clearance + episode.size[:, 2] - PALM_BELOW_TOP
-        carry[:, 2] = carry_height.clamp_min(config.carry_height)
+        carry[:, 2] = carry_height.clamp_min(config.carry_height) + self._raise_box(situation)
         # Up first, then back: the box must clear the knees.
         rise = _smooth(1.0 - memory.descent)
         back = _smooth((1.5 * (1.0 - memory.descent) - 0.5).clamp(0.0, 1.0))
@@ -404,6 +411,14 @@ class LiftBoxExpert:
         limit = config.largest_correction
         change = config.correction_gain * error * active[:, None, None]
         memory.correction = (memory.correction + change).clamp(-limit, limit)
+
+    def _raise_box(self, situation: Situation) -> Tensor:
+        """Height (N,) [m] that makes up for how far the arms sink under a box that is held."""
+        config, memory = self.config, self._memory
+        missing = config.carry_clearance - (situation.bottom - self._task.episode.support_height)
+        change = config.raise_gain * missing * (memory.phase == HOLD)
+        memory.raised = (memory.raised + change).clamp(0.0, config.largest_raise)
+        return memory.raised
 
     def _level_box(self, situation: Situation, forward: Tensor) -> None:
         """Turn the fingers against the pitch of a box that is carried; it swings between the palms."""
