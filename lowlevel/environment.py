@@ -32,7 +32,7 @@ from lowlevel.observation import (
 )
 from lowlevel.randomization import RandomizationConfig, Randomizer
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
-from lowlevel.rotations import from_roll_pitch_yaw, multiply
+from lowlevel.rotations import about_axis, multiply
 from lowlevel.simulation import BatchSimulation
 from lowlevel.snapshot import Snapshot, take_snapshot, with_rows
 from lowlevel.terrain import MAP_SIZE, Terrain, TerrainConfig
@@ -304,7 +304,7 @@ class PilotEnvironment:
         buffers.stepping[ids], buffers.unbalance[ids] = 0.0, 0.0
 
         heading = self._uniform(-torch.pi, torch.pi, count)
-        facing = from_roll_pitch_yaw(heading[:, None] * torch.tensor([0.0, 0.0, 1.0], device=self.device))
+        facing = about_axis(2, heading)
         joint_position = self.motion.default.repeat(count, 1)
         joint_position[:, ARM_JOINTS] = reference[:, ARMS]
         if self.config.nominal.kind == "default":
