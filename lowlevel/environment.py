@@ -18,7 +18,7 @@ from lowlevel.commands import (
     CommandSampler,
     command_space,
 )
-from lowlevel.measures import Measurement, has_fallen, height_error, measure, torso_error
+from lowlevel.measures import Measurement, has_fallen, height_error, torso_error
 from lowlevel.nominal import NominalConfig, NominalMotion, NominalState
 from lowlevel.observation import (
     FRAME_SIZE,
@@ -26,15 +26,15 @@ from lowlevel.observation import (
     PRIVILEGED_SIZE,
     FrameBuilder,
     NoiseConfig,
-    map_observation,
     push_history,
     split_frame,
     start_history,
 )
 from lowlevel.randomization import RandomizationConfig, Randomizer
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
-from lowlevel.rotations import from_roll_pitch_yaw, multiply, rotate_about_vertical
+from lowlevel.rotations import about_axis, multiply
 from lowlevel.simulation import BatchSimulation
+from lowlevel.snapshot import Snapshot, take_snapshot, with_rows
 from lowlevel.terrain import MAP_SIZE, Terrain, TerrainConfig
 from robots.g1.constants import ARM_JOINTS, GAINS, LOWER_JOINTS, NUM_JOINTS, WAIST_JOINTS
 from robots.g1.model import ModelOptions, build_spec
@@ -201,10 +201,8 @@ class PilotEnvironment:
             self.buffers.episode_step = torch.randint(
                 self.max_steps, (self.num_robots,), generator=self.generator, device=self.device
             )
-        measured = measure(self.simulation.read(), self.terrain)
         self._advance_nominal()
-        self._observe(measured, everyone)
-        return self._observation(measured)
+        return self._observe(take_snapshot(self.simulation.read(), self.terrain), everyone)
 
     def step(self, action: Tensor) -> StepResult:
         """Apply residual ``action`` (N, 29) for one control step of 0.02 s."""
@@ -219,7 +217,8 @@ class PilotEnvironment:
         buffers.previous_target = target
         self.simulation.step(applied)
 
-        measured = measure(self.simulation.read(), self.terrain)
+        now = take_snapshot(self.simulation.read(), self.terrain)
+        measured = now.measured
         buffers.previous_action, buffers.action = buffers.action, action
         buffers.episode_step += 1
         self._update_foot_times(measured)
@@ -240,20 +239,18 @@ class PilotEnvironment:
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
         tracked_command = buffers.command
-        next_privileged = self._privileged(measured)
+        next_privileged = self._privileged(now, self._frame(measured))
 
         done = torch.nonzero(fallen | truncated)[:, 0]
-        after = measured
         if len(done):
             self._reset_robots(done)
-            after = measure(self.simulation.read(), self.terrain)
-        buffers.hand_force = self.randomizer.disturb(after.robot, after.heading)
+            now = with_rows(now, done, take_snapshot(self.simulation.read(done), self.terrain))
+        buffers.hand_force = self.randomizer.disturb(now.measured.robot, now.measured.heading)
         self._resample_due_commands()
         self._advance_nominal()
         self._step_count += 1
-        self._observe(after, done)
         return StepResult(
-            observation=self._observation(after),
+            observation=self._observe(now, done),
             reward=reward,
             terminated=fallen,
             truncated=truncated,
@@ -310,7 +307,7 @@ class PilotEnvironment:
         buffers.stepping[ids], buffers.unbalance[ids] = 0.0, 0.0
 
         heading = self._uniform(-torch.pi, torch.pi, count)
-        facing = from_roll_pitch_yaw(heading[:, None] * torch.tensor([0.0, 0.0, 1.0], device=self.device))
+        facing = about_axis(2, heading)
         joint_position = self.motion.default.repeat(count, 1)
         joint_position[:, ARM_JOINTS] = reference[:, ARMS]
         if self.config.nominal.kind == "default":
@@ -354,49 +351,40 @@ class PilotEnvironment:
             self._nominal_state(),
         )
 
-    def _observe(self, measured: Measurement, new_episodes: Tensor) -> None:
+    def _observe(self, now: Snapshot, new_episodes: Tensor) -> dict[str, Tensor]:
         """Push a noisy frame into the histories, restart those of new episodes, refresh the map at 10 Hz."""
         buffers = self.buffers
-        frame = self._frame(measured)
-        frame += self._noise * self._uniform(-1.0, 1.0, *frame.shape)
+        exact_frame = self._frame(now.measured)
+        frame = exact_frame + self._noise * self._uniform(-1.0, 1.0, *exact_frame.shape)
         buffers.history = push_history(buffers.history, frame)
         if len(new_episodes):
             buffers.history[new_episodes] = start_history(frame[new_episodes])
         if self._step_count % MAP_REFRESH_STEPS == 0 or len(new_episodes):
-            elevation = map_observation(self.terrain.elevation_map(measured.robot.base_position, measured.heading))
-            elevation = elevation + self.config.noise.elevation * self._uniform(-1.0, 1.0, *elevation.shape)
+            noise = self.config.noise.elevation * self._uniform(-1.0, 1.0, *now.elevation.shape)
             if self._step_count % MAP_REFRESH_STEPS == 0:
-                buffers.elevation = elevation
+                buffers.elevation = now.elevation + noise
             else:
-                buffers.elevation[new_episodes] = elevation[new_episodes]
-
-    def _observation(self, measured: Measurement) -> dict[str, Tensor]:
+                buffers.elevation[new_episodes] = now.elevation[new_episodes] + noise[new_episodes]
         return {
-            "history": self.buffers.history.flatten(1),
-            "elevation_map": self.buffers.elevation,
-            "flag": self.buffers.flag.clone(),
-            "privileged": self._privileged(measured),
+            "history": buffers.history.flatten(1),
+            "elevation_map": buffers.elevation,
+            "flag": buffers.flag.clone(),
+            "privileged": self._privileged(now, exact_frame),
         }
 
-    def _privileged(self, measured: Measurement) -> Tensor:
-        robot, buffers = measured.robot, self.buffers
-        heading = measured.heading[:, None]
-        elevation = self.terrain.elevation_map(robot.base_position, measured.heading)
+    def _privileged(self, now: Snapshot, exact_frame: Tensor) -> Tensor:
+        measured, buffers = now.measured, self.buffers
         parts = (
             measured.linear_velocity,
-            self._frame(measured),
+            exact_frame,
             height_error(measured, buffers.command)[:, None],
             torso_error(measured, buffers.command),
-            measured.foot_contact.float(),
-            measured.foot_clearance,
-            rotate_about_vertical(-heading, robot.foot_position - robot.base_position[:, None]).flatten(1),
-            rotate_about_vertical(-heading, robot.foot_velocity).flatten(1),
-            rotate_about_vertical(-heading, robot.foot_force).flatten(1) / 400.0,
+            now.feet,
             buffers.hand_force.flatten(1) / 20.0,
             self.randomizer.state.friction,
             self.randomizer.state.added_mass,
             buffers.flag,
-            map_observation(elevation),
+            now.elevation,
         )
         privileged = torch.cat(parts, dim=-1)
         assert privileged.shape[-1] == PRIVILEGED_SIZE

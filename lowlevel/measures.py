@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.rotations import (
+    about_axis,
     conjugate,
     from_roll_pitch_yaw,
     multiply,
@@ -56,8 +57,6 @@ def measure(robot: RobotState, terrain: Terrain) -> Measurement:
     down[:, 2] = -1.0
     ground = terrain.height(robot.foot_position[..., :2])
     lowest = robot.foot_position[..., 2].argmin(dim=1, keepdim=True)
-    heading_quaternion = torch.zeros_like(robot.base_quaternion)
-    heading_quaternion[:, 0], heading_quaternion[:, 3] = torch.cos(heading / 2), torch.sin(heading / 2)
     return Measurement(
         robot=robot,
         heading=heading,
@@ -65,7 +64,7 @@ def measure(robot: RobotState, terrain: Terrain) -> Measurement:
         yaw_rate=rotate(robot.base_quaternion, robot.base_angular_velocity)[:, 2],
         projected_gravity=rotate(conjugate(robot.base_quaternion), down),
         base_height=robot.base_position[:, 2] - ground.gather(1, lowest)[:, 0],
-        torso_orientation=multiply(conjugate(heading_quaternion), robot.torso_quaternion),
+        torso_orientation=multiply(about_axis(2, -heading), robot.torso_quaternion),
         foot_clearance=robot.foot_position[..., 2] - ground,
         foot_contact=robot.foot_force.norm(dim=-1) > LOADED_FOOT_FORCE,
     )

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, POSTURE, TORSO, VELOCITY, is_walking
-from lowlevel.rotations import conjugate, from_roll_pitch_yaw, multiply, rotate, rotate_inverse
+from lowlevel.rotations import about_axis, conjugate, from_roll_pitch_yaw, multiply, rotate, rotate_inverse
 from robots.g1.arm_mass import ArmMass
 from robots.g1.constants import (
     ARM_JOINTS,
@@ -183,12 +183,9 @@ class NominalMotion:
 
         ``waist`` (N, 3): waist joints in the order of the joint table, yaw, roll, pitch [rad].
         """
-        zero = torch.zeros_like(waist[:, 0])
         yaw, roll, pitch = waist.unbind(-1)
-        yawed = from_roll_pitch_yaw(torch.stack([zero, zero, yaw], -1))
-        rolled = from_roll_pitch_yaw(torch.stack([roll, zero, zero], -1))
-        pitched = from_roll_pitch_yaw(torch.stack([zero, pitch, zero], -1))
-        return multiply(from_roll_pitch_yaw(torso), conjugate(multiply(yawed, multiply(rolled, pitched))))
+        tilted = multiply(about_axis(0, roll), about_axis(1, pitch))
+        return multiply(from_roll_pitch_yaw(torso), conjugate(multiply(about_axis(2, yaw), tilted)))
 
     def joint_targets(
         self, state: NominalState, projected_gravity: Tensor, base_angular_velocity: Tensor
@@ -233,12 +230,10 @@ class NominalMotion:
         weight = torch.zeros_like(moment)
         weight[:, 2] = -GRAVITY
         load = torch.linalg.cross(moment, rotate_inverse(torso, weight))
-        yaw, roll, pitch = position[:, WAIST_JOINTS].unbind(1)
-        zero = torch.zeros_like(yaw)
-        to_torso = conjugate(from_roll_pitch_yaw(torch.stack([zero, pitch, zero], -1)))
+        _, roll, pitch = position[:, WAIST_JOINTS].unbind(1)
+        to_torso = about_axis(1, -pitch)
         roll_axis = rotate(to_torso, self._unit[0].expand_as(load))
-        untilted = conjugate(from_roll_pitch_yaw(torch.stack([roll, zero, zero], -1)))
-        yaw_axis = rotate(to_torso, rotate(untilted, self._unit[2].expand_as(load)))
+        yaw_axis = rotate(to_torso, rotate(about_axis(0, -roll), self._unit[2].expand_as(load)))
         torque = torque.clone()
         torque[:, WAIST_JOINTS] -= torch.stack(
             [(yaw_axis * load).sum(-1), (roll_axis * load).sum(-1), load[:, 1]], dim=1

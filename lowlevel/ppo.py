@@ -83,8 +83,8 @@ class PPO:
         widths |= {"velocity": VELOCITY_SIZE, "latent": network_config.latent}
         shapes: dict[str, tuple[int, ...]] = {name: (width,) for name, width in widths.items()}
         shapes |= dict.fromkeys(("log_prob", "reward", "advantage", "returns"), ())
-        images = config.symmetry != "none"
-        self.storage = RolloutStorage(config.steps_per_update, num_envs, shapes, self.device, images)
+        mirrored = config.symmetry == "augmentation"
+        self.storage = RolloutStorage(config.steps_per_update, num_envs, shapes, self.device, mirrored)
         self._minibatch, rest = divmod(self.storage.size, config.minibatches)
         if rest:
             raise ValueError(
@@ -158,19 +158,19 @@ class PPO:
         if calibrating:
             self._calibrate()
         explained = self._store_returns(observation_after["privileged"].to(self.device))
-        if config.symmetry != "none":
+        if config.symmetry == "augmentation":
             self._store_mirror_images()
         old_std = self.actor.log_std.detach().exp().clone()
         history: dict[str, list[float]] = {}
-        for epoch in range(config.epochs):
-            estimating = epoch < config.estimator_epochs
-            order = torch.randperm(storage.size, generator=self.generator, device=self.device)
-            for index in torch.split(order, self._minibatch):
-                samples, mirrored = self._samples(index, estimating)
-                images = self._images(index)
-                losses = self.learner.losses(samples, mirrored, images, old_std, estimating)
-                for name, number in self.learner.step(losses).items():
-                    history.setdefault(name, []).append(number)
+        minibatches = self._draw_minibatches()
+        # All of them now, because the first step changes the estimator.
+        images = [self._images(index) for index in minibatches]
+        for step, index in enumerate(minibatches):
+            estimating = step < config.estimator_epochs * config.minibatches
+            samples, mirrored = self._samples(index, estimating)
+            losses = self.learner.losses(samples, mirrored, images[step], old_std, estimating)
+            for name, number in self.learner.step(losses).items():
+                history.setdefault(name, []).append(number)
         means = {name: sum(numbers) / len(numbers) for name, numbers in history.items()}
         means["estimation/velocity_rmse"] = math.sqrt(means.pop("estimation/velocity_mse"))
         means["estimation/policy_drift"] = self._estimator_drift()
@@ -249,6 +249,14 @@ class PPO:
             rows("latent")[part].copy_(output.latent)
             rows("log_prob")[part].copy_(self.learner.log_prob(output.mean, rows("action")[part]))
 
+    def _draw_minibatches(self) -> list[Tensor]:
+        """Indices of the samples of every gradient step: one shuffled pass over the rollout per epoch."""
+
+        def shuffled() -> Tensor:
+            return torch.randperm(self.storage.size, generator=self.generator, device=self.device)
+
+        return [index for _ in range(self.config.epochs) for index in torch.split(shuffled(), self._minibatch)]
+
     def _samples(self, index: Tensor, estimating: bool) -> tuple[dict[str, Tensor], int]:
         """The samples at ``index``; the first so many of them, second result, are their mirror images."""
         mirrored = 0
@@ -260,12 +268,18 @@ class PPO:
             names += ["history", "next_privileged"]
         return {name: self._rows(name).index_select(0, index) for name in names}, mirrored
 
+    @torch.no_grad()
     def _images(self, index: Tensor) -> dict[str, Tensor] | None:
-        """Mirror images of the last samples at ``index``, which :meth:`_samples` never mirrors."""
+        """Mirror images of the last samples at ``index``, which :meth:`_samples` never mirrors, for the policy."""
         if self.config.symmetry == "none":
             return None
         share = max(1, int(self.config.mirror_loss_share * len(index)))
-        return {name: self._rows(name).index_select(0, index[-share:] + self.storage.size) for name in POLICY_KEYS}
+        rows = {key: self.storage.flat(key).index_select(0, index[-share:]) for key in ACTOR_KEYS}
+        image = {key: self.mirrors(key, values) for key, values in rows.items()}
+        with self.learner.autocast():
+            velocity, latent = self.actor.encode(image["history"], image["elevation_map"])
+        frame = image.pop("history")[:, -self.sizes.frame :].clone()
+        return {**image, "frame": frame, "velocity": velocity, "latent": latent}
 
     def _rows(self, name: str) -> Tensor:
         if name == "frame":
@@ -274,8 +288,8 @@ class PPO:
 
     @torch.no_grad()
     def _estimator_drift(self) -> float:
-        """KL divergence of the policy [nat] that the estimator's own learning caused, on the last samples."""
-        recorded = {key: self.storage.flat(key)[-self._minibatch :] for key in (*ACTOR_KEYS, *POLICY_KEYS[3:])}
+        """KL divergence of the policy [nat] that the estimator's own learning caused, on the last control step."""
+        recorded = {key: self.storage.data[key][-1] for key in (*ACTOR_KEYS, *POLICY_KEYS[3:])}
         recorded["frame"] = recorded["history"][:, -self.sizes.frame :]
         with self.learner.autocast():
             before, _ = self.actor.decide(*(recorded[key] for key in POLICY_KEYS))

@@ -45,6 +45,13 @@ def multiply(first: Tensor, second: Tensor) -> Tensor:
     return torch.cat([scalar, w1 * v2 + w2 * v1 + torch.linalg.cross(v1, v2)], dim=-1)
 
 
+def about_axis(axis: int, angle: Tensor) -> Tensor:
+    """Quaternion (..., 4) of a turn by ``angle`` (...,) [rad] about coordinate ``axis``: 0 is x, 1 is y, 2 is z."""
+    quaternion = angle.new_zeros(*angle.shape, 4)
+    quaternion[..., 0], quaternion[..., 1 + axis] = torch.cos(0.5 * angle), torch.sin(0.5 * angle)
+    return quaternion
+
+
 def from_roll_pitch_yaw(angles: Tensor) -> Tensor:
     """Quaternion (..., 4) of R = Rz(yaw) Ry(pitch) Rx(roll) for ``angles`` (..., 3) = (roll, pitch, yaw) [rad]."""
     cr, cp, cy = torch.cos(0.5 * angles).unbind(-1)

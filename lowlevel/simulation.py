@@ -109,27 +109,33 @@ class BatchSimulation:
         """Current value of a named sensor (N, dim)."""
         return self._tensor(self._sensordata[:, self._sensor_columns[name]])
 
-    def _pair(self, frame: str, quantity: str) -> Tensor:
-        return torch.stack([self.sensor(f"{side}_{frame}_{quantity}") for side in SIDES], dim=1)
+    def read(self, ids: Tensor | None = None) -> RobotState:
+        """Snapshot of the robots ``ids`` (n,), all by default."""
+        rows = slice(None) if ids is None else ids.cpu().numpy()
+        qpos, qvel, torque, sensors = (a[rows] for a in (self._qpos, self._qvel, self._torque, self._sensordata))
+        base_qpos, base_qvel = qpos[:, self._base_qpos], qvel[:, self._base_qvel]
 
-    def read(self) -> RobotState:
-        """Snapshot of all robots."""
-        base_qpos, base_qvel = self._qpos[:, self._base_qpos], self._qvel[:, self._base_qvel]
+        def sensor(name: str) -> Tensor:
+            return self._tensor(sensors[:, self._sensor_columns[name]])
+
+        def pair(frame: str, quantity: str) -> Tensor:
+            return torch.stack([sensor(f"{side}_{frame}_{quantity}") for side in SIDES], dim=1)
+
         return RobotState(
-            joint_position=self._tensor(self._qpos[:, self._joint_qpos]),
-            joint_velocity=self._tensor(self._qvel[:, self._joint_qvel]),
-            joint_torque=self._tensor(self._torque[:, self._actuators]),
+            joint_position=self._tensor(qpos[:, self._joint_qpos]),
+            joint_velocity=self._tensor(qvel[:, self._joint_qvel]),
+            joint_torque=self._tensor(torque[:, self._actuators]),
             base_position=self._tensor(base_qpos[:, :3]),
             base_quaternion=self._tensor(base_qpos[:, 3:]),
             base_linear_velocity=self._tensor(base_qvel[:, :3]),
             base_angular_velocity=self._tensor(base_qvel[:, 3:]),
-            torso_quaternion=self.sensor(f"{TORSO_BODY}_quaternion"),
-            foot_position=self._pair("foot", "position"),
-            foot_velocity=self._pair("foot", "velocity"),
+            torso_quaternion=sensor(f"{TORSO_BODY}_quaternion"),
+            foot_position=pair("foot", "position"),
+            foot_velocity=pair("foot", "velocity"),
             # The sensor reports the force that the foot exerts on the ground.
-            foot_force=-self._pair("foot", "force"),
-            palm_position=self._pair("palm", "position"),
-            palm_quaternion=self._pair("palm", "quaternion"),
+            foot_force=-pair("foot", "force"),
+            palm_position=pair("palm", "position"),
+            palm_quaternion=pair("palm", "quaternion"),
         )
 
     def step(self, targets: Tensor) -> None:

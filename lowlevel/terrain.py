@@ -94,7 +94,8 @@ class Terrain:
         ]
         self.tile_centers = torch.tensor(centers, dtype=torch.float32, device=device)
         self._origin = torch.tensor([-size / 2, -size * len(config.tiles) / 2], device=device)
-        self._raster = torch.from_numpy(self._rasterise()).to(device)
+        # The last row and column stand for the plane around the tiles, which the indices -1 reach as well.
+        self._raster = torch.from_numpy(np.pad(self._rasterise(), (0, 1))).to(device)
         offsets = (torch.arange(MAP_CELLS, device=device) - MAP_CELLS // 2) * MAP_RESOLUTION
         self._map_offsets = torch.stack(torch.meshgrid(offsets, offsets, indexing="ij"), -1).reshape(MAP_SIZE, 2)
 
@@ -131,10 +132,7 @@ class Terrain:
             return torch.zeros(points.shape[:-1], device=points.device)
         cells = torch.floor((points - self._origin) / self.config.raster_resolution).long()
         rows, columns = self._raster.shape
-        i, j = cells[..., 0], cells[..., 1]
-        inside = (i >= 0) & (i < rows) & (j >= 0) & (j < columns)
-        heights = self._raster[i.clamp(0, rows - 1), j.clamp(0, columns - 1)]
-        return torch.where(inside, heights, torch.zeros_like(heights))
+        return self._raster[cells[..., 0].clamp(-1, rows - 1), cells[..., 1].clamp(-1, columns - 1)]
 
     def elevation_map(self, base_position: Tensor, heading: Tensor) -> Tensor:
         """Vertical distance base - terrain [m] (N, 121) on the egocentric grid, aligned with the heading.

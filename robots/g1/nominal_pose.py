@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 PATH = Path(__file__).with_name("nominal_pose.npz")
 """The table shipped with the package."""
@@ -54,7 +55,7 @@ def interpolate(axes: Sequence[Axis], table: Tensor, point: Tensor) -> Tensor:
     """Multilinear interpolation; points outside the grid are moved to its border.
 
     ``table`` (A * B * ..., C) holds C values for every node of the grid of D ``axes`` in row-major order,
-    ``point`` is (N, D); returns (N, C). The 2^D corners around each point are gathered at once.
+    ``point`` is (N, D); returns (N, C). The 2^D corners around each point are gathered and summed at once.
     """
     index = torch.zeros(len(point), 1, dtype=torch.long, device=point.device)
     weight = torch.ones(len(point), 1, dtype=point.dtype, device=point.device)
@@ -66,7 +67,7 @@ def interpolate(axes: Sequence[Axis], table: Tensor, point: Tensor) -> Tensor:
         share = torch.stack([1.0 - fraction, fraction], dim=1)
         index = (index[:, :, None] * axis.size + corner[:, None, :]).flatten(1)
         weight = (weight[:, :, None] * share[:, None, :]).flatten(1)
-    return torch.einsum("nk,nkc->nc", weight, table[index])
+    return functional.embedding_bag(index, table, mode="sum", per_sample_weights=weight)
 
 
 @dataclass(frozen=True)

@@ -47,3 +47,10 @@ def test_roll_pitch_yaw_is_the_product_of_elementary_rotations() -> None:
 def test_small_rotation_vectors_keep_their_precision() -> None:
     tiny = torch.tensor([[1.0, 5e-10, 0.0, 0.0]], dtype=torch.float64)
     assert rotations.rotation_vector(tiny)[0, 0] == pytest.approx(1e-9)
+
+
+def test_turn_about_one_axis_is_the_one_with_a_single_angle() -> None:
+    for axis in range(3):
+        angles = torch.zeros(4, 3)
+        angles[:, axis] = torch.tensor([-3.0, -0.4, 0.0, 2.5])
+        assert torch.allclose(rotations.about_axis(axis, angles[:, axis]), rotations.from_roll_pitch_yaw(angles))
