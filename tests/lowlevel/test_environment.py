@@ -1,5 +1,6 @@
 """The environment: finite, deterministic, honest about time limits, mirrored, and equal to the frozen controller."""
 
+import math
 from dataclasses import fields, replace
 
 import mujoco
@@ -100,7 +101,9 @@ def test_control_period_is_checked() -> None:
 
 def test_zero_action_stands_for_a_second_from_any_height_where_feet_do_not_slip() -> None:
     grip = replace(RandomizationConfig.for_evaluation(), friction=(1.0, 1.0))
-    environment = PilotEnvironment(replace(QUIET, num_robots=16, start_in_posture=1.0, randomization=grip), seed=2)
+    still = replace(QUIET.nominal, stepping_threshold=math.inf)  # no robot may save itself by stepping
+    config = replace(QUIET, num_robots=16, start_in_posture=1.0, randomization=grip, nominal=still)
+    environment = PilotEnvironment(config, seed=2)
     environment.open_range = CommandRange(velocity=0.0, height=1.0, torso=0.0, arms=0.0)
     environment.reset()
     results = [environment.step(torch.zeros(16, 29)) for _ in range(50)]
