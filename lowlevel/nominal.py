@@ -80,7 +80,7 @@ class NominalConfig:
     rights the body."""
     step_damping: float = 0.27
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
-    lean: tuple[float, float] = (0.25, 0.5)
+    lean: tuple[float, float] = (0.28, 0.52)
     """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
     chase it carry the robot along."""
     largest_lean: float = 0.33
