@@ -85,7 +85,7 @@ class NominalConfig:
     chase it carry the robot along."""
     largest_lean: float = 0.33
     """Largest lean along x and along y [rad]."""
-    stepping_threshold: float = 0.22
+    stepping_threshold: float = 0.3
     """Unbalance (:meth:`NominalMotion.joint_targets`) from which a standing robot marches to catch itself [rad]."""
     stepping_time: float = 0.8
     """How long it then marches [s]."""
