@@ -211,10 +211,10 @@ class Trainer:
         try:
             self.ppo.load_state_dict(state["ppo"])
         except (KeyError, RuntimeError, ValueError) as error:
-            # torch lists every difference in a line of its own
-            first, *others = [line.strip() for line in str(error).splitlines() if not line.endswith("):")] or [error]
-            more = f" (and {len(others)} more)" if others else ""
-            raise ValueError(f"the training state belongs to other networks: {first}{more}") from error
+            # torch lists every difference in a line of its own, below a heading
+            lines = [line.strip() for line in str(error).splitlines()]
+            details = [line for line in lines if not line.endswith(":")] or lines
+            raise ValueError(f"the training state belongs to other networks: {' '.join(details)}") from error
         self.curriculum.load_state_dict(state["curriculum"])
         self.environment.open_range = self.curriculum.open_range
         self.fall_rate = float(state["fall_rate"])
