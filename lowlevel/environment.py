@@ -352,7 +352,7 @@ class PilotEnvironment:
         )
 
     def _observe(self, now: Snapshot, new_episodes: Tensor) -> dict[str, Tensor]:
-        """Push a noisy frame into the histories, restart those of new episodes, refresh the map at 10 Hz."""
+        """The observation, after pushing a noisy frame, restarting new histories and refreshing the map (10 Hz)."""
         buffers = self.buffers
         exact_frame = self._frame(now.measured)
         frame = exact_frame + self._noise * self._uniform(-1.0, 1.0, *exact_frame.shape)

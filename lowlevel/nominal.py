@@ -3,7 +3,9 @@
 The paper adds the policy's arm output to the commanded arm joints (III-B-2). Here the same is done for legs and
 waist, as additions to the paper: their nominal target comes from the nominal-pose table; a feed-forward march lifts
 the swing leg in time with a gait clock; and ankles and steps lean against tilt, so that the zero action already
-stands and marches. The training environment and the frozen controller share this module, so they cannot drift apart.
+stands and marches. The march outlasts a command to stop until the robot has slowed down, and a standing robot that
+tips over marches to catch itself. The training environment and the frozen controller share this module, so they
+cannot drift apart.
 """
 
 from __future__ import annotations
@@ -273,7 +275,8 @@ class NominalMotion:
         """Lean against the pelvis' tilt off its nominal ``attitude`` with the ankles and, marching, with steps.
 
         The capture point of a falling pendulum lies in the direction of tilt + rate * sqrt(height / g) (Pratt et al.,
-        Humanoids 2006), so the swing hip moves the foot that way.
+        Humanoids 2006), so the swing hip moves the foot that way. Returns the unbalance (N,), see
+        :meth:`joint_targets`.
         """
         config = self.config
         down = torch.zeros_like(gravity)
