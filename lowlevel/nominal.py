@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, POSTURE, TORSO, VELOCITY, is_walking
-from lowlevel.rotations import about_axis, conjugate, from_roll_pitch_yaw, multiply, rotate, rotate_inverse
+from lowlevel.rotations import about_axis, conjugate, from_roll_pitch_yaw, multiply
 from robots.g1.arm_mass import ArmMass
 from robots.g1.constants import (
     ARM_JOINTS,
@@ -26,19 +26,57 @@ from robots.g1.constants import (
     LEG_JOINTS,
     LOWER_JOINTS,
     NUM_JOINTS,
-    SIDES,
     TOTAL_MASS,
     WAIST_JOINTS,
     Gains,
     joint_index,
 )
-from robots.g1.nominal_pose import NominalPose
+from robots.g1.nominal_pose import NominalPose, NominalStance
+from robots.g1.turns import blend, turn_basis
 
 GRAVITY = 9.81
 """[m/s^2]"""
-_HIP_PITCH = [joint_index(f"{side}_hip_pitch_joint") for side in SIDES]
-_WAIST_AGAINST_LEAN = ("waist_pitch_joint", "waist_roll_joint")
-"""Waist joints that undo a lean along x (forwards) and along y (to the left)."""
+_TORSO_AXES, _WAIST_AXES = (0, 1, 2), (2, 0, 1)
+"""Axes that roll, pitch, yaw of the torso and the waist joints yaw, roll, pitch turn about."""
+
+_MARCH: tuple[dict[str, float], ...] = (
+    # Lift of the left foot, of the right foot: the knee flexes, hip and ankle take half of it back.
+    {"left_hip_pitch": -0.5, "left_knee": 1.0, "left_ankle_pitch": -0.5},
+    {"right_hip_pitch": -0.5, "right_knee": 1.0, "right_ankle_pitch": -0.5},
+    # Shift of the pelvis over the stance foot.
+    {"left_hip_roll": 1.0, "right_hip_roll": 1.0, "left_ankle_roll": -1.0, "right_ankle_roll": -1.0},
+    # Stride forwards, sideways and around: both legs swing against each other and the feet stay level.
+    {"left_hip_pitch": 1.0, "right_hip_pitch": -1.0, "left_ankle_pitch": -1.0, "right_ankle_pitch": 1.0},
+    {"left_hip_roll": -1.0, "right_hip_roll": 1.0, "left_ankle_roll": 1.0, "right_ankle_roll": -1.0},
+    {"left_hip_yaw": -1.0, "right_hip_yaw": 1.0},
+)
+_BALANCE: tuple[dict[str, float], ...] = (
+    # Ankle strategy in roll and pitch.
+    {"left_ankle_roll": 1.0, "right_ankle_roll": 1.0},
+    {"left_ankle_pitch": 1.0, "right_ankle_pitch": 1.0},
+    # Capture steps in roll and pitch, positive while the left foot swings.
+    {"left_hip_roll": -1.0, "right_hip_roll": 1.0},
+    {"left_hip_pitch": -1.0, "right_hip_pitch": 1.0},
+    # Lean along x and y: the waist takes it back, so that the torso keeps its commanded attitude.
+    {"waist_pitch": -1.0},
+    {"waist_roll": 1.0},
+)
+_BEARING: tuple[dict[str, float], ...] = (
+    # Moment of the arms' weight about the waist's yaw, roll and pitch axes, and about the heading frame's y axis.
+    {"waist_yaw": -1.0},
+    {"waist_roll": -1.0},
+    {"waist_pitch": -1.0},
+    {"left_hip_pitch": 0.5, "right_hip_pitch": 0.5},
+)
+
+
+def _joints_moved(rows: tuple[dict[str, float], ...], device: torch.device | str) -> Tensor:
+    """Matrix (rows, 29) from how much there is of each row to joints."""
+    matrix = torch.zeros(len(rows), NUM_JOINTS)
+    for row, joints in zip(matrix, rows, strict=True):
+        for joint, share in joints.items():
+            row[joint_index(f"{joint}_joint")] = share
+    return matrix.to(device)
 
 
 @dataclass(frozen=True)
@@ -111,6 +149,17 @@ class NominalState:
     """Time for which a robot told to stand still marches to catch itself (N,) [s]."""
 
 
+class _Attitude(NamedTuple):
+    """Rotation matrices of N nominal postures."""
+
+    torso: Tensor
+    """Torso in the heading frame (N, 3, 3)."""
+    waist: Tensor
+    """Torso in the pelvis frame (N, 3, 3)."""
+    waist_pitch: Tensor
+    """Turn of the waist pitch joint alone, the last of the three (N, 3, 3)."""
+
+
 class NominalMotion:
     """Advances references and turns them into nominal joint targets; holds no per-robot state itself."""
 
@@ -134,9 +183,13 @@ class NominalMotion:
         rate[TORSO], rate[ARMS] = config.torso_rate, config.arm_rate
         self.arm_mass = ArmMass(device)
         self._default_moment = self.arm_mass.first_moment(self.default[None, ARM_JOINTS])
-        self._unit = torch.eye(3, device=device)
+        self._turn_basis = torch.tensor(turn_basis(_TORSO_AXES + _WAIST_AXES), dtype=torch.float32, device=device)
         self._stepping_torso = torch.tensor(config.stepping_torso, device=device)
         self._stride = torch.tensor(config.stride, device=device)
+        self._lean = torch.tensor([*config.lean, 0.0], device=device)
+        self._march_joints = _joints_moved(_MARCH, device)
+        self._balance_joints = _joints_moved(_BALANCE, device)
+        self._bearing_joints = _joints_moved(_BEARING, device)[:, LOWER_JOINTS]
         self._largest_change = rate * control_period
 
     def initial_state(self, command: Tensor) -> NominalState:
@@ -201,98 +254,71 @@ class NominalMotion:
 
         ``projected_gravity`` (N, 3) and ``base_angular_velocity`` (N, 3) [rad/s] as measured, pelvis frame.
         """
-        targets = self.default.expand(len(state.phase), NUM_JOINTS).clone()
-        targets[:, ARM_JOINTS] = state.reference[:, ARMS]
+        arms = state.reference[:, ARMS]
         unbalance = torch.zeros_like(state.phase)
         if self.config.kind == "default":
-            return targets, unbalance
-        position, torque, shift = self.pose.lookup(state.reference[:, POSTURE])
+            return torch.cat([self.default[LOWER_JOINTS].expand(len(arms), -1), arms], dim=1), unbalance
+        stance = self.pose.lookup(state.reference[:, POSTURE])
+        attitude = self._attitude(state.reference, stance.position)
         if self.config.carry_arms:
-            position, torque = self._carry_arms(state.reference, position, torque, shift)
-        targets[:, LOWER_JOINTS] = position + torque * self._inverse_stiffness
+            stance = self._carry_arms(arms, stance, attitude)
+        targets = torch.cat([stance.position + stance.torque * self._inverse_stiffness, arms], dim=1)
         if self.config.kind == "march":
-            self._add_march(targets, state)
+            targets = torch.addmm(targets, self._march(state), self._march_joints)
         if self.config.balance_stiffness > 0.0:
-            attitude = self.pelvis_attitude(state.reference[:, TORSO], position[:, WAIST_JOINTS])
-            unbalance = self._add_balance(targets, state, attitude, projected_gravity, base_angular_velocity)
+            balance, unbalance = self._balance(state, attitude, projected_gravity, base_angular_velocity)
+            targets = torch.addmm(targets, balance, self._balance_joints)
         return targets, unbalance
 
-    def _carry_arms(self, reference: Tensor, position: Tensor, torque: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions and gravity torques (N, 15) for arms that are not at their default, as the table assumes.
+    def _attitude(self, reference: Tensor, position: Tensor) -> _Attitude:
+        angles = torch.cat([reference[:, TORSO], position[:, WAIST_JOINTS]], dim=1)
+        turns = blend(self._turn_basis, angles[:, :, None, None])
+        roll, pitch, yaw, waist_yaw, waist_roll, waist_pitch = turns.unbind(1)
+        return _Attitude(yaw @ pitch @ roll, waist_yaw @ waist_roll @ waist_pitch, waist_pitch)
+
+    def _carry_arms(self, arms: Tensor, stance: NominalStance, attitude: _Attitude) -> NominalStance:
+        """The stance for arms (N, 14) [rad] that are not at their default, as the table assumes.
 
         The pelvis moves until the centre of mass is back where the table has it; waist and hips bear the moment.
         """
-        moment = self.arm_mass.first_moment(reference[:, ARMS]) - self._default_moment
-        torso = from_roll_pitch_yaw(reference[:, TORSO])
-        offset = -rotate(torso, moment)[:, :2] / TOTAL_MASS
+        moment = self.arm_mass.first_moment(arms) - self._default_moment
+        offset = (attitude.torso @ moment[:, :, None])[:, :2] / -TOTAL_MASS
         offset = offset.clamp(-self.config.largest_shift, self.config.largest_shift)
-        position = position.clone()
-        position[:, LEG_JOINTS] += torch.einsum("njk,nk->nj", shift, offset)
+        legs = torch.baddbmm(stance.position[:, LEG_JOINTS, None], stance.shift, offset)[:, :, 0]
+        position = torch.cat([legs, stance.position[:, WAIST_JOINTS]], dim=1)
 
-        weight = torch.zeros_like(moment)
-        weight[:, 2] = -GRAVITY
-        load = torch.linalg.cross(moment, rotate_inverse(torso, weight))
-        _, roll, pitch = position[:, WAIST_JOINTS].unbind(1)
-        to_torso = about_axis(1, -pitch)
-        roll_axis = rotate(to_torso, self._unit[0].expand_as(load))
-        yaw_axis = rotate(to_torso, rotate(about_axis(0, -roll), self._unit[2].expand_as(load)))
-        torque = torque.clone()
-        torque[:, WAIST_JOINTS] -= torch.stack(
-            [(yaw_axis * load).sum(-1), (roll_axis * load).sum(-1), load[:, 1]], dim=1
-        )
-        torque[:, _HIP_PITCH] += 0.5 * rotate(torso, load)[:, 1:2]
-        return position, torque
+        # Weight in the torso frame is along the third row of the rotation that turns it upright. The waist's axes
+        # there: pitch turns last, so its axis is the torso's own; roll's is seen through pitch, yaw's through both.
+        load = torch.linalg.cross(moment, -GRAVITY * attitude.torso[:, 2])
+        about_yaw, about_roll = (attitude.waist[:, 2] * load).sum(-1), (attitude.waist_pitch[:, 0] * load).sum(-1)
+        sideways = (attitude.torso[:, 1] * load).sum(-1)
+        borne = torch.stack([about_yaw, about_roll, load[:, 1], sideways], dim=1)
+        return NominalStance(position, torch.addmm(stance.torque, borne, self._bearing_joints), stance.shift)
 
-    def _add_march(self, targets: Tensor, state: NominalState) -> None:
-        config = self.config
-        sine, cosine = torch.sin(state.phase), torch.cos(state.phase)
-        forwards, sideways, turn = (state.reference[:, VELOCITY] * self._stride).unbind(-1)
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            lift = config.knee_lift * (sign * sine).clamp_min(0.0) * state.walking
-            # The swing foot travels from behind to ahead of the hip: its offset goes with -cos(phase).
-            swing = -sign * cosine * state.walking
-            pitch = -swing * forwards - 0.5 * lift
-            roll = config.lateral_shift * sine * state.walking
-            offsets = {
-                "hip_pitch": pitch,
-                "hip_roll": roll + swing * sideways,
-                "hip_yaw": swing * turn,
-                "knee": lift,
-                "ankle_pitch": -pitch - lift,
-                "ankle_roll": -roll - swing * sideways,
-            }
-            for joint, offset in offsets.items():
-                targets[:, joint_index(f"{side}_{joint}_joint")] += offset
+    def _march(self, state: NominalState) -> Tensor:
+        """How much of each row of ``_MARCH`` there is (N, 6) [rad]."""
+        sine, cosine = torch.sin(state.phase) * state.walking, torch.cos(state.phase) * state.walking
+        raised = torch.stack([sine, -sine], dim=1).clamp_min(0.0)
+        stride = cosine[:, None] * state.reference[:, VELOCITY] * self._stride
+        return torch.cat([self.config.knee_lift * raised, self.config.lateral_shift * sine[:, None], stride], dim=1)
 
-    def _add_balance(
-        self,
-        targets: Tensor,
-        state: NominalState,
-        attitude: Tensor,
-        gravity: Tensor,
-        angular_velocity: Tensor,
-    ) -> Tensor:
-        """Lean against the pelvis' tilt off its nominal ``attitude`` with the ankles and, marching, with steps.
+    def _balance(
+        self, state: NominalState, attitude: _Attitude, gravity: Tensor, angular_velocity: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """How much of each row of ``_BALANCE`` there is (N, 6) [rad], and the unbalance (N,).
 
-        The capture point of a falling pendulum lies in the direction of tilt + rate * sqrt(height / g) (Pratt et al.,
-        Humanoids 2006), so the swing hip moves the foot that way. Returns the unbalance (N,), see
-        :meth:`joint_targets`.
+        Ankles and, marching, steps lean against the pelvis' tilt off its nominal attitude. The capture point of a
+        falling pendulum lies in the direction of tilt + rate * sqrt(height / g) (Pratt et al., Humanoids 2006), so
+        the swing hip moves the foot that way.
         """
-        config = self.config
-        down = torch.zeros_like(gravity)
-        down[:, 2] = -1.0
-        wanted = rotate_inverse(attitude, down)
-        for axis, lean in enumerate(config.lean):
-            angle = (lean * state.reference[:, axis]).clamp(-config.largest_lean, config.largest_lean) * state.walking
-            wanted[:, axis] += angle
-            # The waist takes the lean back, so that the torso keeps its commanded attitude.
-            targets[:, joint_index(_WAIST_AGAINST_LEAN[axis])] += (-angle, angle)[axis]
-        tilt = torch.linalg.cross(gravity, wanted)
-        ankle = config.balance_stiffness * tilt + config.balance_damping * angular_velocity
-        capture = config.step_stiffness * tilt + config.step_damping * angular_velocity
-        swing = torch.sin(state.phase) * state.walking
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            for axis, direction in ((0, "roll"), (1, "pitch")):
-                targets[:, joint_index(f"{side}_ankle_{direction}_joint")] += ankle[:, axis]
-                targets[:, joint_index(f"{side}_hip_{direction}_joint")] -= sign * swing * capture[:, axis]
-        return (tilt + config.step_damping * angular_velocity)[:, :2].norm(dim=-1)
+        config, walking = self.config, state.walking[:, None]
+        lean = state.reference[:, VELOCITY] * self._lean
+        lean = lean.clamp(-config.largest_lean, config.largest_lean) * walking
+        wanted = lean - (attitude.waist @ attitude.torso[:, 2, :, None])[:, :, 0]
+        tilt = torch.linalg.cross(gravity, wanted)[:, :2]
+        rate = angular_velocity[:, :2]
+        ankle = config.balance_stiffness * tilt + config.balance_damping * rate
+        capture = config.step_stiffness * tilt + config.step_damping * rate
+        swing = torch.sin(state.phase)[:, None] * walking
+        unbalance = (tilt + config.step_damping * rate).norm(dim=1)
+        return torch.cat([ankle, swing * capture, lean[:, :2]], dim=1), unbalance

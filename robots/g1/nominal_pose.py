@@ -7,6 +7,7 @@ the heading frame [rad], R = Rz(yaw) Ry(pitch) Rx(roll). :class:`NominalPose` in
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -51,39 +52,57 @@ class Axis:
         return (self.stop - self.start) / (self.size - 1)
 
 
-def interpolate(axes: Sequence[Axis], table: Tensor, point: Tensor) -> Tensor:
-    """Multilinear interpolation; points outside the grid are moved to its border.
+class GridTable:
+    """Multilinear interpolation in a table over a grid of D axes; points outside are moved to the grid's border."""
 
-    ``table`` (A * B * ..., C) holds C values for every node of the grid of D ``axes`` in row-major order,
-    ``point`` is (N, D); returns (N, C). The 2^D corners around each point are gathered and summed at once.
-    """
-    index = torch.zeros(len(point), 1, dtype=torch.long, device=point.device)
-    weight = torch.ones(len(point), 1, dtype=point.dtype, device=point.device)
-    for axis, coordinate in zip(axes, point.unbind(1), strict=True):
-        scaled = ((coordinate - axis.start) / axis.step).clamp(0.0, axis.size - 1.0)
-        below = scaled.floor().clamp(max=axis.size - 2.0)
-        fraction = scaled - below
-        corner = torch.stack([below, below + 1.0], dim=1).long()
-        share = torch.stack([1.0 - fraction, fraction], dim=1)
-        index = (index[:, :, None] * axis.size + corner[:, None, :]).flatten(1)
-        weight = (weight[:, :, None] * share[:, None, :]).flatten(1)
-    return functional.embedding_bag(index, table, mode="sum", per_sample_weights=weight)
+    def __init__(self, axes: Sequence[Axis], values: Tensor) -> None:
+        """``values`` (A * B * ..., C): C numbers for every node of the grid, in row-major order."""
+
+        def row(numbers: Sequence[float]) -> Tensor:
+            return torch.tensor(numbers, dtype=torch.float32, device=values.device)
+
+        sizes = [axis.size for axis in axes]
+        strides = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
+        self.values = values
+        self._start, self._step = row([axis.start for axis in axes]), row([axis.step for axis in axes])
+        self._last_node, self._last_cell = row([size - 1.0 for size in sizes]), row([size - 2.0 for size in sizes])
+        self._first_node = torch.zeros_like(self._last_node)
+        self._strides = row(strides)
+        corners = torch.cartesian_prod(*[torch.arange(2.0, device=values.device)] * len(sizes))
+        self._corner_index = (corners @ self._strides).long()
+        # A corner's share along an axis is the fraction or one minus it: bias + slope * fraction.
+        self._bias, self._slope = 1.0 - corners, 2.0 * corners - 1.0
+
+    def __call__(self, point: Tensor) -> Tensor:
+        """Interpolate at ``point`` (N, D), giving (N, C): the 2^D corners around each point are weighted and summed."""
+        scaled = ((point - self._start) / self._step).clamp(self._first_node, self._last_node)
+        below = torch.minimum(scaled.floor(), self._last_cell)
+        fraction = (scaled - below).unsqueeze(1)
+        weight = torch.addcmul(self._bias, self._slope, fraction).prod(dim=2)
+        index = (below @ self._strides).long().unsqueeze(1) + self._corner_index
+        return torch.bmm(weight.unsqueeze(1), functional.embedding(index, self.values)).squeeze(1)
 
 
-@dataclass(frozen=True)
 class NominalPose:
-    """The table on one device.
+    """The table on one device: stances, and the limits of the postures that can be held."""
 
-    ``axes``: height [m], roll, pitch, yaw [rad] of the posture grid. ``values`` (nodes, 54): joint positions
-    [rad] and static gravity torques [N m] of the 15 leg and waist joints, shift of the 12 leg joints [rad/m].
-    ``roll_limit`` (nodes of height x |yaw|, 1) and ``pitch_limits`` (nodes of height x |roll| x |yaw|, 2) bound
-    the postures that can be held [rad].
-    """
+    def __init__(
+        self, axes: tuple[Axis, Axis, Axis, Axis], values: Tensor, roll_limit: Tensor, pitch_limits: Tensor
+    ) -> None:
+        """``axes``: height [m], roll, pitch, yaw [rad] of the posture grid.
 
-    axes: tuple[Axis, Axis, Axis, Axis]
-    values: Tensor
-    roll_limit: Tensor
-    pitch_limits: Tensor
+        ``values`` (nodes, 54): joint positions [rad] and static gravity torques [N m] of the 15 leg and waist joints,
+        shift of the 12 leg joints [rad/m]. ``roll_limit`` (nodes of height x |yaw|, 1) and ``pitch_limits`` (nodes of
+        height x |roll| x |yaw|, 2) bound the postures that can be held [rad].
+        """
+        self.axes, self.values, self.roll_limit, self.pitch_limits = axes, values, roll_limit, pitch_limits
+        height, roll, _, yaw = axes
+        half_roll, half_yaw = (Axis(0.0, axis.stop, axis.size // 2 + 1) for axis in (roll, yaw))
+        self._stance = GridTable(axes, values)
+        self._roll_limit = GridTable((height, half_yaw), roll_limit)
+        self._pitch_limits = GridTable((height, half_roll, half_yaw), pitch_limits)
+        self._lowest = torch.tensor([axis.start for axis in axes], device=values.device)
+        self._highest = torch.tensor([axis.stop for axis in axes], device=values.device)
 
     @classmethod
     def load(cls, device: str | torch.device = "cpu", path: Path = PATH) -> NominalPose:
@@ -120,7 +139,7 @@ class NominalPose:
 
     def lookup(self, posture: Tensor) -> NominalStance:
         """The stance for each ``posture`` (N, 4); postures outside the grid are moved to its border."""
-        values = interpolate(self.axes, self.values, posture)
+        values = self._stance(posture)
         position, torque, shift = values.split([NUM_LOWER_JOINTS, NUM_LOWER_JOINTS, 2 * NUM_LEG_JOINTS], dim=1)
         return NominalStance(position, torque, shift.unflatten(1, (NUM_LEG_JOINTS, 2)))
 
@@ -130,14 +149,8 @@ class NominalPose:
         Height and yaw keep to their ranges, roll to a limit that depends on both, and pitch to limits that
         depend on all three. Postures inside stay exactly as they are, so clamping twice changes nothing.
         """
-        height_axis, roll_axis, _, yaw_axis = self.axes
-        half_roll = Axis(0.0, roll_axis.stop, roll_axis.size // 2 + 1)
-        half_yaw = Axis(0.0, yaw_axis.stop, yaw_axis.size // 2 + 1)
-        height = posture[:, 0].clamp(height_axis.start, height_axis.stop)
-        yaw = posture[:, 3].clamp(yaw_axis.start, yaw_axis.stop)
-        limit = interpolate((height_axis, half_yaw), self.roll_limit, torch.stack([height, yaw.abs()], dim=1))[:, 0]
-        roll = torch.minimum(torch.maximum(posture[:, 1], -limit), limit)
-        where = torch.stack([height, roll.abs(), yaw.abs()], dim=1)
-        lower, upper = interpolate((height_axis, half_roll, half_yaw), self.pitch_limits, where).unbind(1)
-        pitch = torch.minimum(torch.maximum(posture[:, 2], lower), upper)
-        return torch.stack([height, roll, pitch, yaw], dim=1)
+        height, roll, pitch, yaw = posture.clamp(self._lowest, self._highest).unbind(1)
+        limit = self._roll_limit(torch.stack([height, yaw.abs()], dim=1))[:, 0]
+        roll = roll.clamp(-limit, limit)
+        lower, upper = self._pitch_limits(torch.stack([height, roll.abs(), yaw.abs()], dim=1)).unbind(1)
+        return torch.stack([height, roll, pitch.clamp(lower, upper), yaw], dim=1)

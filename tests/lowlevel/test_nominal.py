@@ -184,9 +184,10 @@ def test_waist_and_hips_bear_the_moment_of_the_arms(space: CommandSpace) -> None
     command[:, TORSO] = torch.tensor([0.1, 0.5, 0.3])
     command[:, HEIGHT] = 0.6
     command[:, ARMS] += 0.4 * torch.linspace(-1.0, 1.0, 14)
-    position, torque, shift = nominal.pose.lookup(command[:, POSTURE])
-    _, loaded = nominal._carry_arms(command, position, torque, shift)
-    added = (loaded - torque)[0, WAIST_JOINTS].double().numpy()
+    stance = nominal.pose.lookup(command[:, POSTURE])
+    position = stance.position
+    loaded = nominal._carry_arms(command[:, ARMS], stance, nominal._attitude(command, position))
+    added = (loaded.torque - stance.torque)[0, WAIST_JOINTS].double().numpy()
 
     def gravity(arms: np.ndarray) -> np.ndarray:
         q = pin.neutral(model)
