@@ -22,6 +22,8 @@ class RunningNormalizer(nn.Module):
     variance: Tensor
     count: Tensor
     fixed: Tensor
+    scale: Tensor
+    offset: Tensor
 
     def __init__(self, size: int, fixed: Tensor | None = None, floor: float = 1e-2, clip: float = 10.0) -> None:
         """``fixed`` (D,) bool, default none; ``floor`` is added to the deviation; ``clip`` in deviations.
@@ -39,13 +41,21 @@ class RunningNormalizer(nn.Module):
         self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("fixed", fixed.clone())
+        self.register_buffer("scale", torch.ones(size), persistent=False)
+        self.register_buffer("offset", torch.zeros(size), persistent=False)
+        self.register_load_state_dict_post_hook(lambda module, _: module.refresh())
 
     def forward(self, values: Tensor) -> Tensor:
         """Normalise ``values`` (..., D)."""
+        return torch.addcmul(self.offset, values, self.scale).clamp(-self.clip, self.clip)
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        """Derive scale and offset from the moments; needed after the moments are changed from outside."""
         plain = self.fixed | (self.count == 0)
         scale = torch.where(plain, 1.0, 1.0 / (self.variance.sqrt() + self.floor))
-        offset = torch.where(plain, 0.0, -self.mean * scale)
-        return torch.addcmul(offset.float(), values, scale.float()).clamp(-self.clip, self.clip)
+        self.scale.copy_(scale)
+        self.offset.copy_(torch.where(plain, 0.0, -self.mean * scale))
 
     @torch.no_grad()
     def update(self, values: Tensor) -> None:
@@ -70,3 +80,4 @@ class RunningNormalizer(nn.Module):
         self.variance.copy_((self.variance * self.count + squares + between) / merged)
         self.mean.add_(delta * batch_count / merged)
         self.count.copy_(merged)
+        self.refresh()
