@@ -44,7 +44,7 @@ from evaluation.speed import (
 )
 from evaluation.statistics import Figure, mean_figure
 from highlevel.task import load_task
-from lowlevel.controller import ONNX_FILE, Controller, content_hash
+from lowlevel.controller import Controller, content_hash
 from lowlevel.export import freeze
 from lowlevel.presets import PRESETS
 
@@ -120,9 +120,9 @@ def measure_everything(arguments: Arguments, folder: Path, progress: Progress) -
     next_is("controller")
     freeze(trainer).save(folder / "controller")
     torch.set_num_threads(1)
-    controller = Controller.load(folder / "controller")
-    figures |= measure_latency(controller, folder / "controller" / ONNX_FILE, arguments.ticks)
+    figures |= measure_latency(folder / "controller", arguments.ticks)
     next_is("planner")
+    controller = Controller.load(folder / "controller")
     rates = planner_rates(arguments.task, controller, arguments.planner_robots, arguments.cores, arguments.seconds)
     figures["planner_decisions_per_second"] = mean_figure(rates, "1/s")
     next_is("single planners")
@@ -177,12 +177,10 @@ _ROWS = {
     "environment_over_plain_subproc": "environment over baseline",
     "training_steps_per_second": "training end to end, full network",
     "training_update_share": "share of training spent in updates",
-    "controller_tick_p50": "controller tick, one core, median",
-    "controller_tick_p99": "controller tick, one core, 99th percentile",
-    "network_torch_p50": "policy network, torch, median",
-    "network_torch_p99": "policy network, torch, 99th percentile",
-    "network_onnx_p50": "policy network, onnxruntime, median",
-    "network_onnx_p99": "policy network, onnxruntime, 99th percentile",
+    "controller_tick_onnx_p50": "controller tick, one core, ONNX Runtime, median",
+    "controller_tick_onnx_p99": "controller tick, one core, ONNX Runtime, 99th percentile",
+    "controller_tick_torch_p50": "controller tick, one core, torch, median",
+    "controller_tick_torch_p99": "controller tick, one core, torch, 99th percentile",
     "planner_decisions_per_second": "planner decisions, batched",
     "planner_subproc_decisions_per_second": "baseline: single robots in SubprocVecEnv",
     "planner_over_subproc": "planner over baseline",

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import torch
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
@@ -131,34 +130,21 @@ def _subproc_rates(makers: list[Callable[[], Any]], seconds: float) -> list[floa
         environments.close()
 
 
-def measure_latency(controller: Controller, onnx: Path, ticks: int) -> dict[str, Figure]:
-    """One robot on one core: a whole control step in torch, and the policy network alone in both runtimes."""
-    space = controller.config.command_space
-    state = Proprioception(
-        torch.tensor(controller.config.default_position)[None],
-        torch.zeros(1, NUM_JOINTS),
-        torch.zeros(1, 3),
-        torch.tensor([[0.0, 0.0, -1.0]]),
-    )
-    elevation, command, flag = torch.full((1, MAP_SIZE), 0.76), space.neutral()[None], torch.ones(1, 1)
-    controller.reset(1)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(onnx), options, providers=["CPUExecutionProvider"])
-    history = torch.randn(1, controller.actor.sizes.history, generator=torch.Generator().manual_seed(0))
-    inputs = {"history": history.numpy(), "elevation_map": elevation.numpy(), "flag": flag.numpy()}
-    wanted = {value.name for value in session.get_inputs()}
-    inputs = {name: value for name, value in inputs.items() if name in wanted}
-
-    def network() -> None:
-        with torch.no_grad():
-            controller.actor(history, elevation, flag)
-
-    measured = {
-        "controller_tick": lambda: controller.act(state, elevation, command, flag),
-        "network_torch": network,
-        "network_onnx": lambda: session.run(["action"], inputs),
-    }
+def measure_latency(folder: Path, ticks: int) -> dict[str, Figure]:
+    """A control step of one robot on one core, in both runtimes."""
+    measured: dict[str, Callable[[], object]] = {}
+    for runtime in ("torch", "onnx"):
+        controller = Controller.load(folder, runtime=runtime)
+        controller.reset(1)
+        state = Proprioception(
+            torch.tensor(controller.config.default_position)[None],
+            torch.zeros(1, NUM_JOINTS),
+            torch.zeros(1, 3),
+            torch.tensor([[0.0, 0.0, -1.0]]),
+        )
+        command = controller.config.command_space.neutral()[None]
+        elevation = torch.full((1, MAP_SIZE), 0.76)
+        measured[f"controller_tick_{runtime}"] = partial(controller.act, state, elevation, command, torch.ones(1, 1))
     figures = {}
     for name, call in measured.items():
         for _ in range(20):

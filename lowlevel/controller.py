@@ -4,7 +4,7 @@ A controller is a folder. Nothing but this folder is needed to run it, and nothi
 
 ``controller.json``      every convention at full precision, and where the controller comes from
 ``weights.safetensors``  policy weights, normaliser and nominal-pose table
-``controller.onnx``      the policy network alone, for other runtimes
+``controller.onnx``      the whole control step as :mod:`lowlevel.onnx_step` describes it, for other runtimes
 ``golden.json``          reference inputs and outputs that any port can be checked against
 """
 
@@ -14,36 +14,35 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidArgument, InvalidGraph, InvalidProtobuf
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
 from lowlevel.commands import CommandSpace
+from lowlevel.control_step import ControlStep, Memory
 from lowlevel.files import atomic_write
 from lowlevel.golden import GOLDEN_ROBOTS, golden_vectors
 from lowlevel.networks import NetworkConfig, ObservationSizes, PilotActor
-from lowlevel.nominal import NominalConfig, NominalMotion, NominalState
+from lowlevel.nominal import NominalConfig, NominalMotion
 from lowlevel.observation import (
     FRAME,
     FRAME_SIZE,
     HISTORY_LENGTH,
-    FrameBuilder,
     Proprioception,
-    map_observation,
     normalised_columns,
-    push_history,
-    start_history,
 )
+from lowlevel.onnx_step import OnnxStep, export_step
 from lowlevel.plain import from_plain
 from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
     "controller.json",
     "weights.safetensors",
@@ -84,19 +83,6 @@ class ControllerConfig:
     """Grid of the nominal-pose table: height, roll, pitch, yaw."""
 
 
-@dataclass
-class _Memory:
-    """State carried between control steps, one row per robot."""
-
-    nominal: NominalState
-    action: Tensor
-    history: Tensor
-    unbalance: Tensor
-    """As :meth:`NominalMotion.joint_targets` found it last (N,) [rad]."""
-    is_fresh: Tensor
-    """Robots that have not acted since their reset: their history starts with the next frame."""
-
-
 class Controller:
     """A frozen PILOT policy with its history, reference filter and gait clock.
 
@@ -110,7 +96,9 @@ class Controller:
         pose: NominalPose,
         provenance: dict[str, Any],
         device: torch.device | str = "cpu",
+        runtime: OnnxStep | None = None,
     ) -> None:
+        """``runtime`` computes the control steps in place of torch, with the same weights."""
         self.config = config
         self.provenance = provenance
         self.device = torch.device(device)
@@ -118,8 +106,9 @@ class Controller:
         self.gains = Gains(np.array(config.stiffness), np.array(config.damping), np.array(config.action_scale))
         self.motion = NominalMotion(config.nominal, self.gains, config.control_period, device, pose)
         self.action_scale = torch.tensor(config.action_scale, device=device)
-        self._build_frame = FrameBuilder(config.command_space, self.motion, device)
-        self._memory: _Memory | None = None
+        self.step = ControlStep(self.actor, self.motion, config.command_space, self.action_scale, config.action_limit)
+        self._compute = self.step if runtime is None else runtime
+        self._memory: Memory | None = None
         self.gate = torch.zeros(0)
         """Expert activations of the last :meth:`act` (N, 4)."""
 
@@ -127,24 +116,12 @@ class Controller:
 
     def reset(self, num_robots: int, ids: Tensor | None = None) -> None:
         """Forget everything about robots ``ids`` (all ``num_robots`` by default): history, last action, clock."""
+        fresh = Memory.fresh(num_robots, self.config.command_space, self.device)
         if self._memory is None or ids is None or len(self._memory.action) != num_robots:
-            neutral = self.config.command_space.neutral(self.device).repeat(num_robots, 1)
-            self._memory = _Memory(
-                nominal=self.motion.initial_state(neutral),
-                action=torch.zeros(num_robots, NUM_JOINTS, device=self.device),
-                history=torch.zeros(num_robots, HISTORY_LENGTH + 1, FRAME_SIZE, device=self.device),
-                unbalance=torch.zeros(num_robots, device=self.device),
-                is_fresh=torch.ones(num_robots, dtype=torch.bool, device=self.device),
-            )
+            self._memory = fresh
             return
-        memory = self._memory
-        memory.nominal.reference[ids] = self.config.command_space.neutral(self.device)
-        memory.nominal.phase[ids] = 0.0
-        memory.nominal.walking[ids] = 0.0
-        memory.nominal.stepping[ids] = 0.0
-        memory.unbalance[ids] = 0.0
-        memory.action[ids] = 0.0
-        memory.is_fresh[ids] = True
+        for remembered, cleared in zip(self._memory, fresh, strict=True):
+            remembered[ids] = cleared[ids]
 
     @torch.no_grad()
     def act(self, proprioception: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor) -> Tensor:
@@ -162,29 +139,9 @@ class Controller:
         memory = self._memory
         if memory is None or len(memory.action) != len(command):
             raise RuntimeError(f"call reset({len(command)}) before act() with {len(command)} robots")
-        command = self.motion.clamp(command)
-        memory.nominal = self.motion.advance(memory.nominal, command, memory.unbalance)
-        frame = self._build_frame(
-            proprioception.joint_position,
-            proprioception.joint_velocity,
-            proprioception.base_angular_velocity,
-            proprioception.projected_gravity,
-            command,
-            memory.action,
-            memory.nominal,
-        )
-        memory.history = torch.where(
-            memory.is_fresh[:, None, None], start_history(frame), push_history(memory.history, frame)
-        )
-        memory.is_fresh = torch.zeros_like(memory.is_fresh)
-        output = self.actor(memory.history.flatten(1), map_observation(elevation_map), flag)
-        self.gate = output.gate
-        limit = self.config.action_limit
-        memory.action = output.mean.clamp(-limit, limit)
-        nominal, memory.unbalance = self.motion.joint_targets(
-            memory.nominal, proprioception.projected_gravity, proprioception.base_angular_velocity
-        )
-        return nominal + memory.action * self.action_scale
+        result = self._compute(proprioception, elevation_map, command, flag, memory)
+        self.gate, self._memory = result.gate, result.memory
+        return result.targets
 
     def clamp_command(self, command: Tensor) -> Tensor:
         """The command (N, 21) that is observed and scored in place of ``command``."""
@@ -195,14 +152,14 @@ class Controller:
         """Slewed command (N, 21) that the nominal motion follows."""
         if self._memory is None:
             raise RuntimeError("call reset() first")
-        return self._memory.nominal.reference
+        return self._memory.reference
 
     @property
     def gait_phase(self) -> Tensor:
         """Gait phase (N,) [rad] of the next step."""
         if self._memory is None:
             raise RuntimeError("call reset() first")
-        return self._memory.nominal.phase
+        return self._memory.phase
 
     def twin(self, num_robots: int) -> Controller:
         """A controller on the CPU with copies of the weights and a fresh memory for ``num_robots`` robots."""
@@ -231,8 +188,15 @@ class Controller:
     # -- folders ----------------------------------------------------------------------------------------------
 
     @classmethod
-    def load(cls, folder: Path | str, device: torch.device | str = "cpu") -> Controller:
+    def load(
+        cls,
+        folder: Path | str,
+        device: torch.device | str = "cpu",
+        runtime: Literal["torch", "onnx"] = "torch",
+    ) -> Controller:
         """Load a controller folder.
+
+        ``runtime`` computes the control steps: torch, or ONNX Runtime, which is quicker for a few robots on a CPU.
 
         Raises:
             ControllerError: if a file is missing, damaged, of another version, or has weights that are not finite.
@@ -262,7 +226,8 @@ class Controller:
             first_line = str(error).splitlines()[-1].strip()
             raise ControllerError(f"{folder / WEIGHTS_FILE} does not fit {CONFIG_FILE}: {first_line}") from error
         pose = NominalPose(config.pose_axes, *pose_tensors)
-        return cls(config, actor, pose, description["provenance"], device)
+        session = _read_onnx(folder, device) if runtime == "onnx" else None
+        return cls(config, actor, pose, description["provenance"], device, session)
 
     def save(self, folder: Path | str, golden_seed: int = 0) -> None:
         """Write the folder: JSON, weights, ONNX and golden vectors; each file is complete or absent.
@@ -278,8 +243,9 @@ class Controller:
         pose = {f"nominal_pose.{name}": getattr(self.motion.pose, name).cpu() for name in _POSE_TENSORS}
         weights = {name: tensor.cpu().contiguous() for name, tensor in self.actor.state_dict().items()}
         atomic_write(folder / WEIGHTS_FILE, lambda file: file.write(save(weights | pose)))
-        export_onnx(self.actor, folder / ONNX_FILE)
-        golden = golden_vectors(self.twin(GOLDEN_ROBOTS), self.config.command_space, golden_seed)
+        twin = self.twin(GOLDEN_ROBOTS)
+        golden = golden_vectors(twin, self.config.command_space, golden_seed)
+        export_step(twin.step, self.config.command_space, folder / ONNX_FILE)
         atomic_write(folder / GOLDEN_FILE, lambda file: file.write(json.dumps(golden).encode()))
         description = {
             "format_version": FORMAT_VERSION,
@@ -324,24 +290,6 @@ def add_metrics(folder: Path | str, metrics: dict[str, Any]) -> None:
     atomic_write(path, lambda file: file.write(json.dumps(description, indent=1).encode()))
 
 
-def export_onnx(actor: PilotActor, path: Path) -> None:
-    """The policy network as ONNX: (history, elevation_map, flag) to (action, gate, velocity, latent); any batch."""
-    sizes = actor.sizes
-    rows = torch.export.Dim("robots")
-    inputs = (torch.zeros(2, sizes.history), torch.zeros(2, sizes.elevation_map), torch.zeros(2, 1))
-    program = torch.onnx.export(
-        actor,
-        inputs,
-        dynamo=True,
-        verbose=False,
-        input_names=["history", "elevation_map", "flag"],
-        output_names=["action", "gate", "velocity", "latent"],
-        dynamic_shapes=({0: rows}, {0: rows}, {0: rows}),
-    )
-    assert program is not None
-    atomic_write(path, lambda file: file.write(program.model_proto.SerializeToString()))
-
-
 def _read_json(folder: Path, name: str) -> dict[str, Any]:
     path = folder / name
     if not path.is_file():
@@ -353,6 +301,18 @@ def _read_json(folder: Path, name: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ControllerError(f"{path} is damaged: it does not hold a JSON object")
     return content
+
+
+def _read_onnx(folder: Path, device: torch.device | str) -> OnnxStep:
+    if torch.device(device).type != "cpu":
+        raise ControllerError(f"the runtime 'onnx' computes on the CPU, not on {device}: use the runtime 'torch'")
+    path = folder / ONNX_FILE
+    if not path.is_file():
+        raise ControllerError(f"{path} is missing: copy the whole controller folder")
+    try:
+        return OnnxStep(path)
+    except (Fail, InvalidArgument, InvalidGraph, InvalidProtobuf) as error:
+        raise ControllerError(f"{path} is damaged or truncated: {error}") from error
 
 
 def _read_weights(folder: Path) -> dict[str, Tensor]:

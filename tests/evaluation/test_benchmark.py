@@ -11,7 +11,6 @@ from gymnasium.utils.env_checker import check_env
 from evaluation.baseline import PlainMujocoEnv
 from evaluation.benchmark import main
 from evaluation.speed import measure_environment, measure_latency, window_rates
-from lowlevel.controller import ONNX_FILE, Controller
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 
 
@@ -43,9 +42,8 @@ def test_the_shares_of_an_environment_step_add_up(monkeypatch: pytest.MonkeyPatc
 
 
 def test_latency_of_all_runtimes(untrained_controller: Path) -> None:
-    controller = Controller.load(untrained_controller)
-    figures = measure_latency(controller, untrained_controller / ONNX_FILE, ticks=30)
-    for name in ("controller_tick", "network_torch", "network_onnx"):
+    figures = measure_latency(untrained_controller, ticks=30)
+    for name in ("controller_tick_torch", "controller_tick_onnx"):
         median, tail = figures[f"{name}_p50"].value, figures[f"{name}_p99"].value
         assert median is not None and tail is not None
         assert 0.0 < median <= tail < 1000.0

@@ -3,12 +3,15 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
 import onnxruntime
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from lowlevel.control_step import Memory
 from lowlevel.controller import (
     CONFIG_FILE,
     GOLDEN_FILE,
@@ -22,7 +25,7 @@ from lowlevel.controller import (
 from lowlevel.environment import EnvironmentConfig
 from lowlevel.export import export_controller
 from lowlevel.golden import replay
-from lowlevel.observation import map_observation
+from lowlevel.onnx_step import INPUTS, OUTPUTS
 from lowlevel.trainer import Trainer, TrainingConfig
 
 SHIPPED = sorted((Path(__file__).parents[2] / "checkpoints" / "lowlevel").glob("*/"))
@@ -44,29 +47,44 @@ def golden_steps(folder: Path) -> list[dict[str, torch.Tensor]]:
     return [{name: torch.tensor(value) for name, value in step.items()} for step in golden["steps"]]
 
 
-def check_golden(folder: Path) -> None:
-    controller = Controller.load(folder)
+@pytest.fixture(params=["exported", *SHIPPED], ids=lambda path: Path(path).name)
+def any_folder(request: pytest.FixtureRequest, folder: Path) -> Path:
+    return folder if request.param == "exported" else request.param
+
+
+@pytest.mark.parametrize("runtime", ["torch", "onnx"])
+def test_golden_vectors_replay_through_both_runtimes(any_folder: Path, runtime: Literal["torch", "onnx"]) -> None:
+    controller = Controller.load(any_folder, runtime=runtime)
     controller.reset(4)
-    session = onnxruntime.InferenceSession(folder / ONNX_FILE)
-    for step in golden_steps(folder):
+    for step in golden_steps(any_folder):
         assert torch.allclose(replay(controller, step), step["targets"], atol=1e-5)
-        inputs = {
-            "history": step["history"].numpy(),
-            "elevation_map": map_observation(step["elevation_map"]).numpy(),
-            "flag": step["flag"].numpy(),
-        }
-        action = torch.from_numpy(session.run(["action"], inputs)[0])
-        limit = controller.config.action_limit
-        assert torch.allclose(action.clamp(-limit, limit), step["action"], atol=1e-4)
+        assert torch.allclose(controller.last_action, step["action"], atol=1e-4)
 
 
-def test_golden_vectors_replay_through_torch_and_onnx(folder: Path) -> None:
-    check_golden(folder)
+def test_onnx_file_needs_nothing_of_this_package(folder: Path) -> None:
+    """A port feeds measurements and what came out last, by name, for any number of robots."""
+    session = onnxruntime.InferenceSession(folder / ONNX_FILE)
+    steps = golden_steps(folder)
+    space = Controller.load(folder).config.command_space
+    memory = {name: value.numpy() for name, value in Memory.fresh(4, space)._asdict().items()}
+    for step in steps:
+        measured = {name: value.numpy() for name, value in step.items() if name in INPUTS and name not in memory}
+        outputs = dict(zip(OUTPUTS, session.run(OUTPUTS, measured | memory), strict=True))
+        np.testing.assert_allclose(outputs["targets"], step["targets"], atol=1e-5)
+        memory = {name: outputs[f"next_{name}"] for name in memory}
 
 
-@pytest.mark.parametrize("shipped", SHIPPED, ids=lambda path: path.name)
-def test_shipped_controllers_replay_their_golden_vectors(shipped: Path) -> None:
-    check_golden(shipped)
+@pytest.mark.parametrize("keep", [None, 0, 1000])
+def test_missing_or_truncated_onnx_files_are_refused(folder: Path, tmp_path: Path, keep: int | None) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    content = (copy / ONNX_FILE).read_bytes()
+    if keep is None:
+        (copy / ONNX_FILE).unlink()
+    else:
+        (copy / ONNX_FILE).write_bytes(content[:keep])
+    with pytest.raises(ControllerError, match=ONNX_FILE):
+        Controller.load(copy, runtime="onnx")
+    Controller.load(copy)
 
 
 def test_resetting_one_robot_forgets_only_that_robot(folder: Path) -> None:
