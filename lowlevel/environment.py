@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 import torch
 from torch import Tensor
 
+from lowlevel.buffers import Buffers
 from lowlevel.commands import (
     ARMS,
     HEIGHT,
@@ -21,8 +22,6 @@ from lowlevel.commands import (
 from lowlevel.measures import Measurement, has_fallen, height_error, torso_error
 from lowlevel.nominal import NominalConfig, NominalMotion, NominalState
 from lowlevel.observation import (
-    FRAME_SIZE,
-    HISTORY_LENGTH,
     PRIVILEGED_SIZE,
     FrameBuilder,
     NoiseConfig,
@@ -35,7 +34,7 @@ from lowlevel.rewards import RewardWeights, Transition, compute_rewards
 from lowlevel.rotations import about_axis, multiply
 from lowlevel.simulation import BatchSimulation
 from lowlevel.snapshot import Snapshot, take_snapshot, with_rows
-from lowlevel.terrain import MAP_SIZE, Terrain, TerrainConfig
+from lowlevel.terrain import Terrain, TerrainConfig
 from robots.g1.constants import ARM_JOINTS, GAINS, LOWER_JOINTS, NUM_JOINTS, WAIST_JOINTS
 from robots.g1.model import ModelOptions, build_spec
 
@@ -74,29 +73,6 @@ class EnvironmentConfig:
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     rewards: RewardWeights = field(default_factory=RewardWeights)
-
-
-@dataclass
-class Buffers:
-    """Per-robot tensors that live across steps; with the simulation's state they are the whole environment."""
-
-    command: Tensor
-    flag: Tensor
-    command_countdown: Tensor
-    episode_step: Tensor
-    action: Tensor
-    previous_action: Tensor
-    previous_target: Tensor
-    reference: Tensor
-    phase: Tensor
-    walking: Tensor
-    stepping: Tensor
-    unbalance: Tensor
-    history: Tensor
-    elevation: Tensor
-    foot_air_time: Tensor
-    foot_contact_time: Tensor
-    hand_force: Tensor
 
 
 @dataclass(frozen=True)
@@ -157,36 +133,12 @@ class PilotEnvironment:
         self.open_range = CommandRange()
         self._noise = config.noise.frame_amplitude().to(device)
         self._step_count = 0
-        self.buffers = self._empty_buffers(config.num_robots)
+        neutral = self.command_space.neutral(self.device)
+        self.buffers = Buffers.empty(neutral.repeat(config.num_robots, 1))
 
     @property
     def num_robots(self) -> int:
         return self.config.num_robots
-
-    def _empty_buffers(self, n: int) -> Buffers:
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(n, *shape, device=self.device)
-
-        neutral = self.command_space.neutral(self.device).repeat(n, 1)
-        return Buffers(
-            command=neutral,
-            flag=zeros(1),
-            command_countdown=zeros(),
-            episode_step=torch.zeros(n, dtype=torch.long, device=self.device),
-            action=zeros(NUM_JOINTS),
-            previous_action=zeros(NUM_JOINTS),
-            previous_target=zeros(NUM_JOINTS),
-            reference=neutral.clone(),
-            phase=zeros(),
-            walking=zeros(),
-            stepping=zeros(),
-            unbalance=zeros(),
-            history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
-            elevation=zeros(MAP_SIZE),
-            foot_air_time=zeros(2),
-            foot_contact_time=zeros(2),
-            hand_force=zeros(2, 3),
-        )
 
     def _uniform(self, low: float, high: float, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=self.generator, device=self.device)
@@ -359,18 +311,19 @@ class PilotEnvironment:
         buffers.history = push_history(buffers.history, frame)
         if len(new_episodes):
             buffers.history[new_episodes] = start_history(frame[new_episodes])
-        if self._step_count % MAP_REFRESH_STEPS == 0 or len(new_episodes):
-            noise = self.config.noise.elevation * self._uniform(-1.0, 1.0, *now.elevation.shape)
-            if self._step_count % MAP_REFRESH_STEPS == 0:
-                buffers.elevation = now.elevation + noise
-            else:
-                buffers.elevation[new_episodes] = now.elevation[new_episodes] + noise[new_episodes]
+        if self._step_count % MAP_REFRESH_STEPS == 0:
+            buffers.elevation = self._noisy(now.elevation)
+        elif len(new_episodes):
+            buffers.elevation[new_episodes] = self._noisy(now.elevation[new_episodes])
         return {
             "history": buffers.history.flatten(1),
             "elevation_map": buffers.elevation,
             "flag": buffers.flag.clone(),
             "privileged": self._privileged(now, exact_frame),
         }
+
+    def _noisy(self, elevation: Tensor) -> Tensor:
+        return elevation + self.config.noise.elevation * self._uniform(-1.0, 1.0, *elevation.shape)
 
     def _privileged(self, now: Snapshot, exact_frame: Tensor) -> Tensor:
         measured, buffers = now.measured, self.buffers

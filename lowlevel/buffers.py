@@ -1,0 +1,63 @@
+"""What the low-level environment remembers about its robots between steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lowlevel.observation import FRAME_SIZE, HISTORY_LENGTH
+from lowlevel.terrain import MAP_SIZE
+from robots.g1.constants import NUM_JOINTS
+
+
+@dataclass
+class Buffers:
+    """Per-robot tensors that live across steps; with the simulation's state they are the whole environment."""
+
+    command: Tensor
+    flag: Tensor
+    command_countdown: Tensor
+    episode_step: Tensor
+    action: Tensor
+    previous_action: Tensor
+    previous_target: Tensor
+    reference: Tensor
+    phase: Tensor
+    walking: Tensor
+    stepping: Tensor
+    unbalance: Tensor
+    history: Tensor
+    elevation: Tensor
+    foot_air_time: Tensor
+    foot_contact_time: Tensor
+    hand_force: Tensor
+
+    @classmethod
+    def empty(cls, neutral: Tensor) -> Buffers:
+        """Buffers of robots that stand under the ``neutral`` command (N, 21)."""
+        n = len(neutral)
+
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(n, *shape, device=neutral.device)
+
+        return cls(
+            command=neutral,
+            flag=zeros(1),
+            command_countdown=zeros(),
+            episode_step=torch.zeros(n, dtype=torch.long, device=neutral.device),
+            action=zeros(NUM_JOINTS),
+            previous_action=zeros(NUM_JOINTS),
+            previous_target=zeros(NUM_JOINTS),
+            reference=neutral.clone(),
+            phase=zeros(),
+            walking=zeros(),
+            stepping=zeros(),
+            unbalance=zeros(),
+            history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
+            elevation=zeros(MAP_SIZE),
+            foot_air_time=zeros(2),
+            foot_contact_time=zeros(2),
+            hand_force=zeros(2, 3),
+        )
