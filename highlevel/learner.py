@@ -52,6 +52,11 @@ class PlannerPPO(PPO):
         """Whether the next update is of the critic alone."""
         return self.finished_updates < self.warm_up_updates
 
+    @torch.no_grad()
+    def set_exploration(self, log_std: float) -> None:
+        """Give every action the standard deviation exp(``log_std``)."""
+        self.policy.log_std.fill_(log_std)
+
     def train(self) -> None:
         """Learn from the collected rollout."""
         for parameter in actor_parameters(self.policy):

@@ -118,6 +118,7 @@ class PlannerTrainer:
                     self.config.seed,
                     lambda epoch, error: update(epoch, f"action error {error:.3f}"),
                 )
+            self.model.set_exploration(self.config.ppo.log_std_after_cloning)
             self._log({f"cloning/{name}": value for name, value in asdict(result).items()})
             self.planner().save(self.folder / CLONED_FOLDER)
         self.phase = "ppo"

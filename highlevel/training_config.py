@@ -27,6 +27,9 @@ class PPOConfig:
     """Without demonstrations."""
     learning_rate_after_cloning: float = 3e-5
     """With demonstrations."""
+    log_std_after_cloning: float = -3.2
+    """Logarithm of the standard deviation of the action from then on: grasps that were cloned fail under the
+    exploration that training from nothing needs."""
     clip_range: float = 0.15
     """Of the probability ratio."""
     target_kl: float = 0.02

@@ -17,6 +17,7 @@ from highlevel.planner import Planner
 from highlevel.run_folder import BEST_FOLDER, LOG_FILE, STATE_FILE, read_config
 from highlevel.train import main
 from highlevel.trainer import PlannerTrainer
+from highlevel.training_config import PPOConfig
 from lowlevel.checks import NonFiniteError
 
 _TINY = [
@@ -189,6 +190,8 @@ def test_cloning_comes_first_and_the_actor_waits_for_the_critic(
     late = torch.load(tmp_path / "learning" / STATE_FILE, weights_only=True)["policy"]
     torch.testing.assert_close(warm["action_net.weight"], cloned["output.weight"], rtol=0, atol=0)
     torch.testing.assert_close(warm["features_extractor.mean"], cloned["mean"], rtol=0, atol=0)
+    expected = torch.full((21,), PPOConfig().log_std_after_cloning)
+    torch.testing.assert_close(warm["log_std"], expected, msg="the clone explores less than training from nothing")
     assert not torch.equal(late["action_net.weight"], cloned["output.weight"])
     assert not torch.equal(warm["value_net.weight"], late["value_net.weight"])
     entries = [json.loads(line) for line in (tmp_path / "warming" / LOG_FILE).read_text().splitlines()]
