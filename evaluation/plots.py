@@ -64,6 +64,23 @@ def plot_curves(
     _save(canvas, path)
 
 
+def plot_overlays(
+    path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], label: str, columns: int = 4
+) -> None:
+    """One panel per title, in it one named curve (x (T,), y (T,)) per case; cases keep their colours."""
+    rows = -(-len(panels) // columns)
+    canvas, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 2.6 * rows), squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis, (title, curves) in zip(axes.flat, panels.items(), strict=False):
+        for name, (x, y) in curves.items():
+            axis.plot(x, y, linewidth=1, label=name)
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel(label, fontsize=8)
+    axes.flat[0].legend(fontsize=7)
+    _save(canvas, path)
+
+
 def plot_heat_map(path: Path, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
     """``values`` (rows, columns) with their numbers written in; NaN stays blank."""
     canvas, axis = pyplot.subplots(figsize=(1.6 + 1.1 * len(columns), 1.4 + 0.5 * len(rows)))

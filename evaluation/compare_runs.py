@@ -1,0 +1,84 @@
+"""Training curves of several low-level runs side by side: ``python -m evaluation.compare_runs RUN RUN ...``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from evaluation.plots import plot_overlays
+from evaluation.reports import run_command
+from lowlevel.trainer import LOG_FILE
+
+PANELS = {
+    "episode/steps_between_falls": "steps between falls",
+    "reward/total": "reward [1/s]",
+    "tracking/E_v": "E_v [m/s]",
+    "tracking/E_omega": "E_omega [rad/s]",
+    "tracking/E_h": "E_h [m]",
+    "tracking/E_r": "E_r [rad]",
+    "tracking/E_p": "E_p [rad]",
+    "tracking/E_y": "E_y [rad]",
+}
+"""Logged figure to panel title; all are measured under exploration noise and the curriculum of the moment."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Draw the training curves of runs over their environment steps."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of the runs; a curve is named after its folder."""
+    output: Path = Path("runs/comparison.png")
+    """Picture to write."""
+    window: int = 10
+    """Updates over which curves are averaged."""
+
+
+def read_curves(run: Path, window: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Environment steps (T,) of a run's log and the figures of :data:`PANELS` (T,), averaged over ``window`` updates.
+
+    Raises:
+        ValueError: if the folder holds no log of a low-level run, or one shorter than the window.
+    """
+    path = run / LOG_FILE
+    if not path.is_file():
+        raise ValueError(f"{path} is missing: give folders of train-lowlevel's runs")
+    entries = [json.loads(line) for line in path.read_text().splitlines()]
+    entries = [entry for entry in entries if all(name in entry for name in PANELS)]
+    if len(entries) < window:
+        raise ValueError(f"{path} has {len(entries)} updates, fewer than the window of {window}")
+    kernel = np.full(window, 1.0 / window)
+    steps = np.convolve([entry["steps"] for entry in entries], kernel, mode="valid")
+    curves = {name: np.convolve([entry[name] for entry in entries], kernel, mode="valid") for name in PANELS}
+    return steps, curves
+
+
+def _run(arguments: Arguments) -> None:
+    if not arguments.runs:
+        raise ValueError("give the folders of at least one run")
+    if arguments.window < 1:
+        raise ValueError("--window must be at least 1")
+    curves = {run.name: read_curves(run, arguments.window) for run in arguments.runs}
+    panels = {
+        title: {name: (steps / 1e6, figures[key]) for name, (steps, figures) in curves.items()}
+        for key, title in PANELS.items()
+    }
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    plot_overlays(arguments.output, panels, "million environment steps")
+    print(f"curves of {len(curves)} runs: {arguments.output}")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of ``python -m evaluation.compare_runs``."""
+    parsed = tyro.cli(Arguments, args=arguments)
+    run_command("evaluation.compare_runs", lambda: _run(parsed))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
