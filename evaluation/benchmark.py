@@ -28,7 +28,6 @@ from evaluation.reports import (
     format_figure,
     markdown_table,
     metrics,
-    progress_bar,
     run_command,
     write_metrics,
     write_results,
@@ -47,6 +46,7 @@ from highlevel.task import load_task
 from lowlevel.controller import Controller, content_hash
 from lowlevel.export import freeze
 from lowlevel.presets import PRESETS
+from lowlevel.progress import ProgressReport
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def _run(arguments: Arguments) -> None:
     load_task(arguments.task)
     check_output(arguments.output)
     print(f"measuring on {arguments.cores} cores", flush=True)
-    with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
+    with tempfile.TemporaryDirectory() as folder, ProgressReport() as progress:
         figures, identity = measure_everything(arguments, Path(folder), progress)
     machine = describe_machine(arguments.cores)
     content = metrics(figures, seed=0, controller=identity, machine=machine, settings=_settings(arguments))

@@ -21,7 +21,6 @@ from evaluation.reports import (
     REPORT_FILE,
     check_output,
     markdown_table,
-    progress_bar,
     run_command,
     write_json,
     write_results,
@@ -34,6 +33,7 @@ from highlevel.registration import find_controller
 from highlevel.task import Decision, Outcome, Task, load_task, rows
 from lowlevel.controller import Controller, content_hash
 from lowlevel.measures import Measurement
+from lowlevel.progress import ProgressReport
 
 RECORDING_FILE, OUTCOME_FILE = "episode.rrd", "outcome.json"
 
@@ -172,7 +172,7 @@ def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tupl
     twin.adopt_sizes(environment.simulation, 0)
     network = environment.controller.config.network
     result: StepResult | None = None
-    with Recorder(recording, arguments.live) as recorder, progress_bar() as progress:
+    with Recorder(recording, arguments.live) as recorder, ProgressReport() as progress:
         bar = progress.add_task("episode", total=environment.max_decisions)
         film = EpisodeRecording(recorder, twin, network.experts if network.mixture else 1)
         while result is None or not bool(result.done[0]):

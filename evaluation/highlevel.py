@@ -21,7 +21,6 @@ from evaluation.reports import (
     format_figure,
     markdown_table,
     metrics,
-    progress_bar,
     run_command,
     write_json,
     write_metrics,
@@ -34,6 +33,7 @@ from highlevel.planner import Planner, planner_hash
 from highlevel.registration import find_controller
 from highlevel.task import Task, load_task
 from lowlevel.controller import Controller, content_hash
+from lowlevel.progress import ProgressReport
 
 SCRIPTED = "scripted"
 EPISODES_FILE = "episodes.json"
@@ -118,7 +118,7 @@ def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
         for name in control_names(task):
             runs[name] = (with_control(task, name), arguments.control_episodes)
     results: dict[str, list[EpisodeRecord]] = {}
-    with progress_bar() as progress:
+    with ProgressReport() as progress:
         bar = progress.add_task("episodes", total=sum(count for _, count in runs.values()))
         finished = 0
         for name, (variant, count) in runs.items():

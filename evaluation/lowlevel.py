@@ -22,7 +22,6 @@ from evaluation.reports import (
     format_figure,
     markdown_table,
     metrics,
-    progress_bar,
     run_command,
     write_metrics,
     write_results,
@@ -51,6 +50,7 @@ from evaluation.tracking import (
 )
 from lowlevel.controller import Controller, add_metrics, content_hash
 from lowlevel.measures import TRACKING_FIGURES
+from lowlevel.progress import ProgressReport
 
 PAPER: dict[str, dict[str, float]] = {
     "simple": dict(
@@ -158,7 +158,7 @@ def evaluate(controller: Controller, identity: str, arguments: Arguments) -> Eva
     walks = walking_episodes(space, arguments.walk_episodes, seed, tiles)
     modes = mode_episodes(space, seed)
     skills = {skill.name: skill_episodes(skill, space, arguments.skill_episodes, seed) for skill in SKILLS}
-    with progress_bar() as progress:
+    with ProgressReport() as progress:
         total = sum(batch_steps(arena, episodes) for episodes in (protocol, walks, modes, *skills.values()))
         task = progress.add_task("tracking", total=total)
 

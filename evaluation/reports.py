@@ -12,8 +12,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
 from evaluation.statistics import Figure
 from lowlevel.provenance import git_revision
 
@@ -29,17 +27,6 @@ def run_command(name: str, command: Callable[[], None]) -> None:
     except KeyboardInterrupt:
         print(f"{name}: interrupted, nothing was written", file=sys.stderr)
         sys.exit(130)
-
-
-def progress_bar() -> Progress:
-    """A bar with percentage, time spent and time left."""
-    columns = (
-        BarColumn(),
-        TextColumn("{task.percentage:>5.1f}%"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    return Progress(TextColumn("{task.description}"), *columns)
 
 
 def check_output(folder: Path) -> None:

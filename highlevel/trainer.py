@@ -10,7 +10,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
@@ -36,6 +35,7 @@ from highlevel.training_config import PlannerTrainingConfig
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.controller import Controller, content_hash
 from lowlevel.interrupts import stop_on_signals
+from lowlevel.progress import ProgressReport
 from lowlevel.provenance import describe_run
 
 SELECTION_SEED, DEMONSTRATION_SEED = 1_000_000, 2_000_000
@@ -290,14 +290,6 @@ class _TrainingCallback(BaseCallback):
 
 @contextmanager
 def _progress(name: str, total: int) -> Iterator[Callable[[int, str], None]]:
-    columns = (
-        TextColumn(name),
-        BarColumn(),
-        TextColumn("{task.percentage:>5.1f}%"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Progress(*columns) as progress:
-        task = progress.add_task("starting", total=total)
-        yield lambda completed, text: progress.update(task, completed=completed, description=text)
+    with ProgressReport() as progress:
+        task = progress.add_task(name, total=total)
+        yield lambda completed, text: progress.update(task, completed=completed, description=f"{name}: {text}")

@@ -12,7 +12,6 @@ from pickle import UnpicklingError
 from typing import Any
 
 import torch
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
@@ -33,6 +32,7 @@ from lowlevel.observation import (
     normalised_columns,
 )
 from lowlevel.ppo import PPO, PPOConfig
+from lowlevel.progress import ProgressReport
 from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import NUM_JOINTS
 
@@ -124,7 +124,9 @@ class Trainer:
         if not self.observation:
             self.observation = self.environment.reset(spread_episodes=True)
         last_save = time.monotonic()
-        with stop_on_signals(self._request_stop), self._progress() as (progress, task), self._log() as log:
+        progress = ProgressReport(hidden=rank() != 0)
+        task = progress.add_task("starting", total=self.config.total_steps, completed=self.steps)
+        with stop_on_signals(self._request_stop), progress, self._log() as log:
             while self.steps < self.config.total_steps and not self._stop_requested:
                 started = time.monotonic()
                 figures = self.iterate()
@@ -230,17 +232,6 @@ class Trainer:
     def _request_stop(self) -> None:
         """End the run at the next safe point, with its work saved."""
         self._stop_requested = True
-
-    @contextmanager
-    def _progress(self) -> Iterator[tuple[Progress, Any]]:
-        columns = (
-            BarColumn(),
-            TextColumn("{task.percentage:>5.1f}%"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, TextColumn("{task.description}"), disable=rank() != 0) as progress:
-            yield progress, progress.add_task("starting", total=self.config.total_steps, completed=self.steps)
 
     @contextmanager
     def _log(self) -> Iterator[Any]:
