@@ -70,6 +70,10 @@ class PPOConfig:
     """First standard deviation of the exploration noise [action units]."""
     std_bounds: tuple[float, float] = (0.05, 1.0)
     """Range of the exploration noise [action units]."""
+    noise_correlation: float = 0.0
+    """Correlation of the exploration noise with that of the control step before, in [0, 1). White noise averages out
+    over a stride; correlated noise shows what leaning on for longer does (Hollenstein et al., AAAI 2024). PPO goes on
+    as if the noise were white."""
     max_grad_norm: float = 1.0
     """Gradient norm to which each of the three groups is clipped."""
     symmetry: Literal["none", "augmentation", "loss"] = "loss"
@@ -94,6 +98,8 @@ class PPOConfig:
         low, high = self.std_bounds
         if not 0 < self.mirror_loss_share <= 0.5:
             raise ValueError(f"mirror_loss_share {self.mirror_loss_share} is not between 0 and 0.5")
+        if not 0.0 <= self.noise_correlation < 1.0:
+            raise ValueError(f"noise_correlation {self.noise_correlation} is not at least 0 and below 1")
         if not 0 < low <= self.initial_std <= high:
             raise ValueError(f"initial_std {self.initial_std} is outside std_bounds {self.std_bounds}")
 

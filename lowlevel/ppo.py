@@ -77,6 +77,7 @@ class PPO:
         self.actor = self.learner.actor
         self.critic = self.learner.critic
         self.generator = torch.Generator(self.device).manual_seed(seed + 1000 * rank())
+        self._noise: Tensor | None = None
         widths = {"history": sizes.history, "elevation_map": sizes.elevation_map, "flag": 1}
         widths |= {"privileged": sizes.privileged, "next_privileged": sizes.privileged}
         widths |= {"action": sizes.action, "mean": sizes.action}
@@ -106,8 +107,7 @@ class PPO:
         """
         observation = {key: observation[key].to(self.device) for key in OBSERVATION_KEYS}
         output = self.learner.policy(observation)
-        noise = torch.randn(output.mean.shape, generator=self.generator, device=self.device)
-        action = output.mean + self.actor.log_std.exp() * noise
+        action = output.mean + self.actor.log_std.exp() * self._draw_noise(output.mean)
         if not bool(torch.isfinite(action).all()):
             for key, values in observation.items():
                 require_finite(f"observation {key!r} at rollout step {self.storage.position}", values)
@@ -120,6 +120,13 @@ class PPO:
         }
         self.storage.write({**observation, **estimates, **acted})
         return action
+
+    def _draw_noise(self, like: Tensor) -> Tensor:
+        """Standard normal noise of the shape of ``like``, correlated with that of the step before."""
+        fresh = torch.randn(like.shape, generator=self.generator, device=self.device)
+        kept = self.config.noise_correlation
+        self._noise = fresh if self._noise is None else kept * self._noise + math.sqrt(1.0 - kept * kept) * fresh
+        return self._noise
 
     @torch.no_grad()
     def deterministic(self, observation: Mapping[str, Tensor]) -> Tensor:
@@ -300,16 +307,19 @@ class PPO:
     def state_dict(self) -> dict[str, Any]:
         """Everything that learning depends on, as tensors, numbers, strings, lists and dicts."""
         generator = self.generator.get_state()
-        return {**self.learner.state_dict(), "generator": generator, "updates": self.updates}
+        return {**self.learner.state_dict(), "generator": generator, "noise": self._noise, "updates": self.updates}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a :meth:`state_dict`, dropping a half-filled rollout.
+        """Restore a :meth:`state_dict`, dropping a half-filled rollout and the noise of another number of robots.
 
         A single process continues bit for bit. With several ranks the state is rank 0's: it continues its own
         noise, and the others draw a fresh sequence.
         """
         self.learner.load_state_dict(state)
         self.updates = int(state["updates"])
+        noise = state.get("noise")
+        fits = rank() == 0 and noise is not None and len(noise) == self.storage.num_envs
+        self._noise = noise.to(self.device) if fits else None
         if rank() == 0:
             self.generator.set_state(state["generator"].cpu())
         else:

@@ -213,6 +213,23 @@ def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
     assert float(deviations.min()) > 0.2999 and float(deviations.max()) < 0.4001
 
 
+def test_exploration_noise_is_correlated_as_stated() -> None:
+    """And a restored state goes on with the same noise."""
+    ppo = make_ppo(4096, noise_correlation=0.8, steps_per_update=12, minibatches=1)
+    observed = observation(torch.Generator().manual_seed(0), 4096)
+    mean = ppo.deterministic(observed)
+    noise = torch.stack([ppo.act(observed) - mean for _ in range(10)])
+    saved = ppo.state_dict()
+    after = ppo.act(observed) - mean
+    deviation = ppo.actor.log_std.detach().exp()
+    torch.testing.assert_close(noise[-1].std(dim=0), deviation, rtol=0.1, atol=0)
+    correlation = (noise[1:] * noise[:-1]).mean(dim=(0, 1)) / deviation.square()
+    torch.testing.assert_close(correlation, torch.full((4,), 0.8), rtol=0, atol=0.04)
+    other = make_ppo(4096, noise_correlation=0.8, steps_per_update=12, minibatches=1)
+    other.load_state_dict(saved)
+    assert torch.equal(other.act(observed) - mean, after)
+
+
 def test_bfloat16_hidden_layers_change_little() -> None:
     exact, rounded = make_ppo(), make_ppo(autocast=True)
     run_update(exact, 0)
