@@ -317,9 +317,9 @@ class PPO:
         """
         self.learner.load_state_dict(state)
         self.updates = int(state["updates"])
-        noise = state.get("noise")
-        fits = rank() == 0 and noise is not None and len(noise) == self.storage.num_envs
-        self._noise = noise.to(self.device) if fits else None
+        self._noise = state.get("noise")
+        if (self._noise is not None and len(self._noise) != self.storage.num_envs) or rank() > 0:
+            self._noise = None
         if rank() == 0:
             self.generator.set_state(state["generator"].cpu())
         else:
