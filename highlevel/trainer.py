@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -182,7 +182,14 @@ class PlannerTrainer:
             action=task.action,
             hidden=self.config.network.hidden,
         )
-        provenance = describe_run(self.config, decisions=self.model.num_timesteps, hours=self.trained_seconds / 3600.0)
+        # A planner travels: of the files that made it, it keeps the names, not where they lay.
+        recorded = self.config.demonstration_file
+        named = replace(
+            self.config,
+            controller=Path(self.controller.name),
+            demonstration_file=None if recorded is None else Path(recorded.name),
+        )
+        provenance = describe_run(named, decisions=self.model.num_timesteps, hours=self.trained_seconds / 3600.0)
         return Planner(config, PlannerActor.from_policy(self.model.policy, config.hidden), provenance)
 
     def select(self) -> float:
