@@ -169,7 +169,7 @@ class Arena:
             raise ValueError(f"the controller runs every {expected} s, the evaluation every {self.period} s")
         randomization = RandomizationConfig.for_evaluation()
         self._randomizer = Randomizer(randomization, self.simulation, torch.Generator())
-        self._proprioception_noise = noise.frame_amplitude()[:_PROPRIOCEPTION_SIZE]
+        self._proprioception_noise = noise.frame_amplitude()
         self._elevation_noise = noise.elevation
 
     @property

@@ -191,7 +191,7 @@ class PilotEnvironment:
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
         tracked_command = buffers.command
-        next_privileged = self._privileged(now, self._frame(measured))
+        next_privileged = self._privileged(now, self._frame(measured), transition.torso_error)
 
         done = torch.nonzero(fallen | truncated)[:, 0]
         if len(done):
@@ -307,7 +307,8 @@ class PilotEnvironment:
         """The observation, after pushing a noisy frame, restarting new histories and refreshing the map (10 Hz)."""
         buffers = self.buffers
         exact_frame = self._frame(now.measured)
-        frame = exact_frame + self._noise * self._uniform(-1.0, 1.0, *exact_frame.shape)
+        frame = exact_frame.clone()
+        frame[:, : len(self._noise)] += self._noise * self._uniform(-1.0, 1.0, self.num_robots, len(self._noise))
         buffers.history = push_history(buffers.history, frame)
         if len(new_episodes):
             buffers.history[new_episodes] = start_history(frame[new_episodes])
@@ -319,19 +320,19 @@ class PilotEnvironment:
             "history": buffers.history.flatten(1),
             "elevation_map": buffers.elevation,
             "flag": buffers.flag.clone(),
-            "privileged": self._privileged(now, exact_frame),
+            "privileged": self._privileged(now, exact_frame, torso_error(now.measured, buffers.command)),
         }
 
     def _noisy(self, elevation: Tensor) -> Tensor:
         return elevation + self.config.noise.elevation * self._uniform(-1.0, 1.0, *elevation.shape)
 
-    def _privileged(self, now: Snapshot, exact_frame: Tensor) -> Tensor:
+    def _privileged(self, now: Snapshot, exact_frame: Tensor, torso_error: Tensor) -> Tensor:
         measured, buffers = now.measured, self.buffers
         parts = (
             measured.linear_velocity,
             exact_frame,
             height_error(measured, buffers.command)[:, None],
-            torso_error(measured, buffers.command),
+            torso_error,
             now.feet,
             buffers.hand_force.flatten(1) / 20.0,
             self.randomizer.state.friction,

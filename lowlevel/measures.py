@@ -121,10 +121,9 @@ def has_fallen(measured: Measurement, reference: Tensor) -> Tensor:
 
     ``reference`` (N, 21) is the slewed command, so that a step of the command is not mistaken for a fall.
     """
-    up = torch.zeros_like(measured.robot.base_position)
-    up[:, 2] = 1.0
-    wanted = rotate(from_roll_pitch_yaw(reference[:, TORSO]), up)
-    actual = rotate(measured.torso_orientation, up)
-    tilt = torch.acos((wanted * actual).sum(-1).clamp(-1.0, 1.0))
+    wanted = from_roll_pitch_yaw(reference[:, TORSO])
+    _, x, y, _ = multiply(conjugate(wanted), measured.torso_orientation).unbind(-1)
+    # The cosine of the angle between the two vertical axes.
+    tilt = torch.acos((1.0 - 2.0 * (x * x + y * y)).clamp(-1.0, 1.0))
     too_low = measured.base_height < torch.clamp(reference[:, HEIGHT] - 0.25, min=0.18)
     return (tilt > 0.9) | too_low

@@ -7,6 +7,7 @@ reference and the gait clock, without which the nominal motion under the residua
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import takewhile
 
 import torch
 from torch import Tensor
@@ -118,14 +119,9 @@ class NoiseConfig:
     """[m]"""
 
     def frame_amplitude(self) -> Tensor:
-        """Half-width of the noise on every column of a frame (FRAME_SIZE,)."""
-        amplitudes = {
-            "joint_position": self.joint_position,
-            "joint_velocity": self.joint_velocity,
-            "base_angular_velocity": self.base_angular_velocity,
-            "projected_gravity": self.projected_gravity,
-        }
-        return torch.cat([torch.full((block.size,), amplitudes.get(block.name, 0.0)) for block in FRAME])
+        """Half-width of the noise on what is measured, the first M columns of a frame (M,)."""
+        measured = takewhile(lambda block: hasattr(self, block.name), FRAME)
+        return torch.cat([torch.full((block.size,), getattr(self, block.name)) for block in measured])
 
 
 class FrameBuilder:

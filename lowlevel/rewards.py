@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -58,6 +59,11 @@ class Transition:
     foot_contact_time: Tensor
     fallen: Tensor
 
+    @cached_property
+    def torso_error(self) -> Tensor:
+        """As :func:`lowlevel.measures.torso_error` has it (N, 3) [rad]."""
+        return torso_error(self.measured, self.command)
+
 
 def linear_velocity(t: Transition) -> Tensor:
     """Laplace kernel on the horizontal velocity error, scale 0.3 m/s.
@@ -79,7 +85,7 @@ def base_height(t: Transition) -> Tensor:
 
 def torso_orientation(t: Transition) -> Tensor:
     """Laplace kernel on the torso attitude error, scale 0.3 rad."""
-    return torch.exp(-torso_error(t.measured, t.command).abs().sum(-1) / 0.3)
+    return torch.exp(-t.torso_error.abs().sum(-1) / 0.3)
 
 
 def upper_body_position(t: Transition) -> Tensor:

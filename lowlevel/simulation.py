@@ -204,7 +204,8 @@ class BatchSimulation:
 
     def diverged(self) -> Tensor:
         """Robots whose state is not finite (N,)."""
-        finite = np.isfinite(self._batch.state).all(axis=1)
+        # A sum is finite only if all of its terms are.
+        finite = np.isfinite(self._batch.state.sum(axis=1))
         return torch.from_numpy(~finite).to(self.device)
 
     def robot_model(self, robot: int) -> mujoco.MjModel:
