@@ -49,7 +49,10 @@ def read_curves(run: Path, window: int) -> tuple[np.ndarray, dict[str, np.ndarra
     path = run / LOG_FILE
     if not path.is_file():
         raise ValueError(f"{path} is missing: give folders of train-lowlevel's runs")
-    entries = [json.loads(line) for line in path.read_text().splitlines()]
+    try:
+        entries = [json.loads(line) for line in path.read_text().splitlines()]
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
     entries = [entry for entry in entries if all(name in entry for name in PANELS)]
     if len(entries) < window:
         raise ValueError(f"{path} has {len(entries)} updates, fewer than the window of {window}")
@@ -64,7 +67,11 @@ def _run(arguments: Arguments) -> None:
         raise ValueError("give the folders of at least one run")
     if arguments.window < 1:
         raise ValueError("--window must be at least 1")
+    if not arguments.output.suffix:
+        raise ValueError(f"{arguments.output} names no picture: give a file such as comparison.png")
     curves = {run.name: read_curves(run, arguments.window) for run in arguments.runs}
+    if len(curves) < len(set(arguments.runs)):
+        raise ValueError("two of the folders have the same name, which curves are told apart by: rename one")
     panels = {
         title: {name: (steps / 1e6, figures[key]) for name, (steps, figures) in curves.items()}
         for key, title in PANELS.items()

@@ -199,8 +199,11 @@ class Controller:
         ``runtime`` computes the control steps: torch, or ONNX Runtime, which is quicker for a few robots on a CPU.
 
         Raises:
-            ControllerError: if a file is missing, damaged, of another version, or has weights that are not finite.
+            ControllerError: if a file is missing, damaged, of another version, or has weights that are not finite;
+                or if the runtime is unknown or not for this device.
         """
+        if runtime not in ("torch", "onnx"):
+            raise ControllerError(f"there is no runtime {runtime!r}: use 'torch' or 'onnx'")
         folder = Path(folder)
         description = _read_json(folder, CONFIG_FILE)
         version = description.get("format_version")

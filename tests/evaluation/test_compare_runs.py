@@ -40,3 +40,17 @@ def test_bad_input_is_one_sentence(run: Path, tmp_path: Path, arguments: list[st
     message = str(stopped.value)
     assert message.startswith("evaluation.compare_runs: ") and "\n" not in message
     assert not output.exists()
+
+
+def test_damaged_logs_and_ambiguous_names_are_refused(run: Path, tmp_path: Path) -> None:
+    other = tmp_path / "elsewhere" / run.name
+    other.mkdir(parents=True)
+    (other / LOG_FILE).write_text("{")
+    with pytest.raises(SystemExit, match="is damaged"):
+        main([str(other), "--output", str(tmp_path / "curves.png")])
+    (other / LOG_FILE).write_text((run / LOG_FILE).read_text())
+    with pytest.raises(SystemExit, match="same name"):
+        main([str(run), str(other), "--output", str(tmp_path / "curves.png")])
+    with pytest.raises(SystemExit, match="names no picture"):
+        main([str(run), "--output", str(tmp_path)])
+    assert not (tmp_path / "curves.png").exists()

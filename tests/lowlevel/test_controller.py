@@ -74,6 +74,13 @@ def test_onnx_file_needs_nothing_of_this_package(folder: Path) -> None:
         memory = {name: outputs[f"next_{name}"] for name in memory}
 
 
+def test_unknown_runtimes_are_refused(folder: Path) -> None:
+    with pytest.raises(ControllerError, match="no runtime 'tensorflow'"):
+        Controller.load(folder, runtime="tensorflow")  # type: ignore[arg-type]
+    with pytest.raises(ControllerError, match="on the CPU"):
+        Controller.load(folder, device="meta", runtime="onnx")
+
+
 @pytest.mark.parametrize("keep", [None, 0, 1000])
 def test_missing_or_truncated_onnx_files_are_refused(folder: Path, tmp_path: Path, keep: int | None) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
