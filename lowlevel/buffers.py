@@ -17,6 +17,7 @@ class Buffers:
     """Per-robot tensors that live across steps; with the simulation's state they are the whole environment."""
 
     command: Tensor
+    tracked_command: Tensor
     flag: Tensor
     command_countdown: Tensor
     episode_step: Tensor
@@ -27,6 +28,7 @@ class Buffers:
     phase: Tensor
     walking: Tensor
     stepping: Tensor
+    settling: Tensor
     unbalance: Tensor
     history: Tensor
     elevation: Tensor
@@ -44,6 +46,7 @@ class Buffers:
 
         return cls(
             command=neutral,
+            tracked_command=neutral.clone(),
             flag=zeros(1),
             command_countdown=zeros(),
             episode_step=torch.zeros(n, dtype=torch.long, device=neutral.device),
@@ -54,6 +57,7 @@ class Buffers:
             phase=zeros(),
             walking=zeros(),
             stepping=zeros(),
+            settling=zeros(),
             unbalance=zeros(),
             history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
             elevation=zeros(MAP_SIZE),

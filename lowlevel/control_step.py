@@ -36,6 +36,8 @@ class Memory(NamedTuple):
     """Fade-in of the march (N,) in [0, 1]."""
     stepping: Tensor
     """Time for which a robot told to stand still marches to catch itself (N,) [s]."""
+    settling: Tensor
+    """Time for which a robot told to stand still keeps its posture (N,) [s]."""
     unbalance: Tensor
     """As :meth:`NominalMotion.joint_targets` found it last (N,) [rad]."""
     action: Tensor
@@ -57,6 +59,7 @@ class Memory(NamedTuple):
             phase=zeros(),
             walking=zeros(),
             stepping=zeros(),
+            settling=zeros(),
             unbalance=zeros(),
             action=zeros(NUM_JOINTS),
             history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
@@ -93,15 +96,15 @@ class ControlStep(nn.Module):
         self, measured: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor, memory: Memory
     ) -> StepResult:
         """One control period, with ``elevation_map`` (N, 121) [m], ``command`` (N, 21) and ``flag`` (N, 1)."""
+        state = NominalState(memory.reference, memory.phase, memory.walking, memory.stepping, memory.settling)
         command = self.motion.clamp(command)
-        state = NominalState(memory.reference, memory.phase, memory.walking, memory.stepping)
         state = self.motion.advance(state, command, memory.unbalance)
         frame = self._build_frame(
             measured.joint_position,
             measured.joint_velocity,
             measured.base_angular_velocity,
             measured.projected_gravity,
-            command,
+            self.motion.tracked_command(state, command),
             memory.action,
             state,
         )
@@ -117,6 +120,7 @@ class ControlStep(nn.Module):
             state.phase,
             state.walking,
             state.stepping,
+            state.settling,
             unbalance,
             action,
             history,

@@ -178,7 +178,7 @@ class PilotEnvironment:
         truncated = (buffers.episode_step >= self.max_steps) & ~fallen
         transition = Transition(
             measured=measured,
-            command=buffers.command,
+            command=buffers.tracked_command,
             flag=buffers.flag,
             action=action,
             previous_action=buffers.previous_action,
@@ -190,7 +190,7 @@ class PilotEnvironment:
             fallen=fallen,
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
-        tracked_command = buffers.command
+        command = buffers.command
         next_privileged = self._privileged(now, self._frame(measured), transition.torso_error)
 
         done = torch.nonzero(fallen | truncated)[:, 0]
@@ -209,7 +209,7 @@ class PilotEnvironment:
             next_privileged=next_privileged,
             terms=terms,
             measured=measured,
-            command=tracked_command,
+            command=command,
         )
 
     def set_command(self, ids: Tensor, command: Tensor, flag: Tensor, hold: float = float("inf")) -> None:
@@ -223,13 +223,15 @@ class PilotEnvironment:
 
     def _nominal_state(self) -> NominalState:
         buffers = self.buffers
-        return NominalState(buffers.reference, buffers.phase, buffers.walking, buffers.stepping)
+        return NominalState(buffers.reference, buffers.phase, buffers.walking, buffers.stepping, buffers.settling)
 
     def _advance_nominal(self) -> None:
         buffers = self.buffers
-        state = self.motion.advance(self._nominal_state(), buffers.command, buffers.unbalance)
-        buffers.reference, buffers.phase = state.reference, state.phase
-        buffers.walking, buffers.stepping = state.walking, state.stepping
+        before = self._nominal_state()
+        after = self.motion.advance(before, buffers.command, buffers.unbalance)
+        buffers.tracked_command = self.motion.tracked_command(after, buffers.command)
+        buffers.reference, buffers.phase, buffers.walking = after.reference, after.phase, after.walking
+        buffers.stepping, buffers.settling = after.stepping, after.settling
 
     def _update_foot_times(self, measured: Measurement) -> None:
         contact, period = measured.foot_contact, self.control_period
@@ -256,7 +258,7 @@ class PilotEnvironment:
         reference = torch.where(in_posture, buffers.command[ids], neutral).clone()
         reference[:, VELOCITY] = 0.0
         buffers.reference[ids], buffers.phase[ids], buffers.walking[ids] = reference, 0.0, 0.0
-        buffers.stepping[ids], buffers.unbalance[ids] = 0.0, 0.0
+        buffers.stepping[ids], buffers.settling[ids], buffers.unbalance[ids] = 0.0, 0.0, 0.0
 
         heading = self._uniform(-torch.pi, torch.pi, count)
         facing = about_axis(2, heading)
@@ -298,7 +300,7 @@ class PilotEnvironment:
             robot.joint_velocity,
             robot.base_angular_velocity,
             measured.projected_gravity,
-            buffers.command,
+            buffers.tracked_command,
             buffers.action,
             self._nominal_state(),
         )
@@ -320,7 +322,7 @@ class PilotEnvironment:
             "history": buffers.history.flatten(1),
             "elevation_map": buffers.elevation,
             "flag": buffers.flag.clone(),
-            "privileged": self._privileged(now, exact_frame, torso_error(now.measured, buffers.command)),
+            "privileged": self._privileged(now, exact_frame, torso_error(now.measured, buffers.tracked_command)),
         }
 
     def _noisy(self, elevation: Tensor) -> Tensor:
@@ -331,7 +333,7 @@ class PilotEnvironment:
         parts = (
             measured.linear_velocity,
             exact_frame,
-            height_error(measured, buffers.command)[:, None],
+            height_error(measured, buffers.tracked_command)[:, None],
             torso_error,
             now.feet,
             buffers.hand_force.flatten(1) / 20.0,

@@ -3,9 +3,9 @@
 The paper adds the policy's arm output to the commanded arm joints (III-B-2). Here the same is done for legs and
 waist, as additions to the paper: their nominal target comes from the nominal-pose table; a feed-forward march lifts
 the swing leg in time with a gait clock; and ankles and steps lean against tilt, so that the zero action already
-stands and marches. The march outlasts a command to stop until the robot has slowed down, and a standing robot that
-tips over marches to catch itself. The training environment and the frozen controller share this module, so they
-cannot drift apart.
+stands and marches. The march outlasts a command to stop until the robot has slowed down, and only then does it move
+to the posture that it is to stand in; a standing robot that tips over marches to catch itself. The training
+environment and the frozen controller share this module, so they cannot drift apart.
 """
 
 from __future__ import annotations
@@ -98,8 +98,11 @@ class NominalConfig:
     """Slew rate of the torso attitude reference [rad/s]."""
     arm_rate: float = 4.0
     """Slew rate of the arm reference [rad/s]."""
-    walking_ramp: float = 0.3
+    walking_ramp: float = 0.1
     """Time over which the march fades in and out [s]."""
+    settling_time: float = 0.5
+    """A robot told to stand keeps its posture until its march has been over for this long [s]; 0: it does not wait
+    for the march either."""
     knee_lift: float = 0.76
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
     lateral_shift: float = 0.035
@@ -120,10 +123,10 @@ class NominalConfig:
     rights the body."""
     step_damping: float = 0.27
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
-    lean: tuple[float, float] = (0.28, 0.52)
+    lean: tuple[float, float] = (0.33, 0.62)
     """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
     chase it carry the robot along."""
-    largest_lean: float = 0.33
+    largest_lean: float = 0.4
     """Largest lean along x and along y [rad]."""
     stepping_threshold: float = 0.3
     """Unbalance (:meth:`NominalMotion.joint_targets`) from which a standing robot marches to catch itself [rad]."""
@@ -147,6 +150,8 @@ class NominalState:
     """Fade-in of the march (N,) in [0, 1]."""
     stepping: Tensor
     """Time for which a robot told to stand still marches to catch itself (N,) [s]."""
+    settling: Tensor
+    """Time for which a robot told to stand still keeps its posture (N,) [s]."""
 
 
 class _Attitude(NamedTuple):
@@ -196,7 +201,7 @@ class NominalMotion:
         """References at their goal, phase zero, standing."""
         count = len(command)
         zeros = torch.zeros(count, device=command.device)
-        return NominalState(command.clone(), zeros, zeros.clone(), zeros.clone())
+        return NominalState(command.clone(), zeros, zeros.clone(), zeros.clone(), zeros.clone())
 
     def clamp(self, command: Tensor) -> Tensor:
         """Move the posture of ``command`` (N, 21) into the feasible region; everything else is unchanged."""
@@ -204,16 +209,31 @@ class NominalMotion:
         clamped[:, POSTURE] = self.pose.clamp(command[:, POSTURE])
         return clamped
 
+    def tracked_command(self, state: NominalState, command: Tensor) -> Tensor:
+        """What of ``command`` (N, 21) is to be tracked in ``state``: what the policy sees and is rewarded for.
+
+        Its velocity is the reference's: a policy that sees another one brakes while the nominal motion still leans
+        forwards. Its posture waits until a robot told to stop has settled: most falls of standing robots came from a
+        change of posture while they still swayed from their last steps.
+        """
+        return torch.cat([state.reference[:, VELOCITY], self._posture(state, command), command[:, ARMS]], dim=1)
+
+    def _posture(self, state: NominalState, command: Tensor) -> Tensor:
+        """Posture of ``command`` (N, 21), or of the reference while the robot settles (N, 4)."""
+        settles = (state.settling > 0.0) & ~is_walking(command)
+        return torch.where(settles[:, None], state.reference[:, POSTURE], command[:, POSTURE])
+
     def advance(self, state: NominalState, command: Tensor, unbalance: Tensor) -> NominalState:
         """One control step of reference filter and gait clock towards ``command`` (N, 21).
 
         ``unbalance`` (N,) [rad]: as the last :meth:`joint_targets` found it.
         """
-        change = (command - state.reference).clamp(-self._largest_change, self._largest_change)
+        goal = torch.cat([command[:, VELOCITY], self._posture(state, command), command[:, ARMS]], dim=1)
+        change = (goal - state.reference).clamp(-self._largest_change, self._largest_change)
         reference = state.reference + change
         # A march sways by as much, so only one that fades out starts anew; so does a move to another posture.
         loses_balance = (unbalance > self.config.stepping_threshold) & (state.walking <= 0.5)
-        rests = (reference[:, POSTURE] == command[:, POSTURE]).all(dim=1)
+        rests = (reference[:, POSTURE] == goal[:, POSTURE]).all(dim=1)
         is_upright = (reference[:, TORSO].abs() <= self._stepping_torso).all(dim=1)
         is_tall = reference[:, HEIGHT] >= self.config.stepping_height
         steps = loses_balance & rests & is_upright & is_tall
@@ -225,7 +245,8 @@ class NominalMotion:
         step = 2.0 * math.pi * self.config.gait_frequency * self.control_period
         moves = walking > 0.0
         phase = torch.where(moves, (state.phase + step) % (2.0 * math.pi), torch.zeros_like(state.phase))
-        return NominalState(reference, phase, walking, stepping)
+        settling = torch.where(moves, self.config.settling_time, (state.settling - self.control_period).clamp_min(0.0))
+        return NominalState(reference, phase, walking, stepping, settling)
 
     def clock(self, state: NominalState) -> Tensor:
         """Gait clock as the policy sees it (N, 2): sine and cosine of the phase, faded out at rest."""

@@ -143,7 +143,7 @@ class FrameBuilder:
         last_action: Tensor,
         nominal: NominalState,
     ) -> Tensor:
-        """Frame (N, FRAME_SIZE) from measurements, the clamped command and the nominal motion's state."""
+        """Frame (N, FRAME_SIZE) from measurements, the tracked command and the nominal motion's state."""
         reference = (nominal.reference - self._middle) / self._half_range
         parts = (
             joint_position - self._default,

@@ -37,7 +37,7 @@ class RandomizationConfig:
     """Downward force on each hand [N]."""
     hand_squeeze: tuple[float, float] = (-30.0, 10.0)
     """Force on each hand towards the other one [N]; negative pushes outwards, as a squeezed box does."""
-    push_velocity: float = 0.5
+    push_velocity: float = 0.3
     """Largest horizontal velocity change of a push, per axis [m/s]."""
     push_interval: tuple[float, float] = (4.0, 8.0)
     """Time between pushes [s]."""

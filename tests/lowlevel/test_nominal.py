@@ -7,8 +7,17 @@ import pinocchio as pin
 import pytest
 import torch
 
-from lowlevel.commands import ARMS, HEIGHT, POSTURE, TORSO, VELOCITY, CommandSpace, command_space
-from lowlevel.nominal import NominalConfig, NominalMotion
+from lowlevel.commands import (
+    ARMS,
+    HEIGHT,
+    POSTURE,
+    STANDING_SPEED,
+    TORSO,
+    VELOCITY,
+    CommandSpace,
+    command_space,
+)
+from lowlevel.nominal import NominalConfig, NominalMotion, NominalState
 from robots.g1.constants import (
     ARM_JOINTS,
     DEFAULT_POSITION,
@@ -85,6 +94,38 @@ def test_a_robot_that_tips_over_marches_for_a_while(space: CommandSpace) -> None
         marched += 1
         state = nominal.advance(state, stand, BALANCED)
     assert marched * 0.02 == pytest.approx(nominal.config.stepping_time + nominal.config.walking_ramp, abs=0.05)
+
+
+def test_a_robot_told_to_stop_settles_before_it_changes_posture(space: CommandSpace) -> None:
+    nominal = motion()
+    walk, squat = space.neutral()[None].clone(), space.neutral()[None].clone()
+    walk[:, VELOCITY.start] = 0.4
+    squat[:, HEIGHT], squat[:, ARMS] = 0.5, squat[:, ARMS] + 0.3
+
+    def steps_until_it_moves(state: NominalState) -> int:
+        for step in range(200):
+            state = nominal.advance(state, squat, BALANCED)
+            tracked = nominal.tracked_command(state, squat)
+            assert torch.equal(tracked[:, VELOCITY], state.reference[:, VELOCITY])
+            if torch.equal(tracked, squat):
+                return step
+            assert torch.equal(tracked[:, POSTURE], walk[:, POSTURE])
+            assert torch.equal(tracked[:, ARMS], squat[:, ARMS])
+        raise AssertionError("it never moves")
+
+    standing = nominal.initial_state(space.neutral()[None])
+    assert steps_until_it_moves(standing) == 0
+    walking = standing
+    for _ in range(50):
+        walking = nominal.advance(walking, walk, BALANCED)
+    assert torch.equal(nominal.tracked_command(walking, walk), walk)
+    slowing_down = (0.4 - STANDING_SPEED) / nominal.config.velocity_rate
+    expected = slowing_down + nominal.config.walking_ramp + nominal.config.settling_time
+    assert steps_until_it_moves(walking) * 0.02 == pytest.approx(expected, abs=0.05)
+    at_once = motion(settling_time=0.0)
+    stopping = at_once.advance(at_once.advance(walking, walk, BALANCED), squat, BALANCED)
+    tracked = at_once.tracked_command(stopping, squat)
+    assert torch.equal(tracked[:, VELOCITY.stop :], squat[:, VELOCITY.stop :])
 
 
 def test_a_robot_in_a_deep_squat_does_not_march(space: CommandSpace) -> None:
