@@ -98,7 +98,7 @@ class NominalConfig:
     """Slew rate of the torso attitude reference [rad/s]."""
     arm_rate: float = 4.0
     """Slew rate of the arm reference [rad/s]."""
-    walking_ramp: float = 0.1
+    walking_ramp: float = 0.2
     """Time over which the march fades in and out [s]."""
     settling_time: float = 0.5
     """A robot told to stand keeps its posture until its march has been over for this long [s]; 0: it does not wait
