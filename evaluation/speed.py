@@ -62,11 +62,11 @@ def measure_training(config: TrainingConfig, folder: Path, updates: int) -> tupl
 
 
 class _TimedSimulation:
-    """A simulation that adds up the time spent in physics."""
+    """A simulation that adds up the time that MuJoCo takes: for steps, and for the constants and states of resets."""
 
     def __init__(self, simulation: Any) -> None:
         self._simulation = simulation
-        self.seconds = 0.0
+        self.step_seconds = self.reset_seconds = 0.0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._simulation, name)
@@ -74,16 +74,26 @@ class _TimedSimulation:
     def step(self, targets: torch.Tensor) -> None:
         began = time.perf_counter()
         self._simulation.step(targets)
-        self.seconds += time.perf_counter() - began
+        self.step_seconds += time.perf_counter() - began
+
+    def forward(self, ids: torch.Tensor | None = None) -> None:
+        began = time.perf_counter()
+        self._simulation.forward(ids)
+        self.reset_seconds += time.perf_counter() - began
+
+    def update_constants(self, ids: torch.Tensor) -> None:
+        began = time.perf_counter()
+        self._simulation.update_constants(ids)
+        self.reset_seconds += time.perf_counter() - began
 
 
 def measure_environment(environment: PilotEnvironment, seconds: float) -> dict[str, Figure]:
-    """The environment with zero actions, and physics alone as seen from within it."""
+    """The environment with zero actions, physics steps alone as seen from within it, and what is not MuJoCo's."""
     count = environment.num_robots
     action = torch.zeros(count, NUM_JOINTS)
     simulation = environment.simulation
     timed = _TimedSimulation(simulation)
-    environment.simulation = timed  # type: ignore[assignment]
+    environment.simulation = environment.randomizer.simulation = timed  # type: ignore[assignment]
 
     def step() -> int:
         environment.step(action)
@@ -93,14 +103,15 @@ def measure_environment(environment: PilotEnvironment, seconds: float) -> dict[s
     try:
         for _ in range(WINDOWS):
             step()
-            timed.seconds, done, began = 0.0, 0, time.perf_counter()
+            timed.step_seconds, timed.reset_seconds = 0.0, 0.0
+            done, began = 0, time.perf_counter()
             while (elapsed := time.perf_counter() - began) < seconds / WINDOWS or not done:
                 done += step()
             environment_rates.append(done / elapsed)
-            physics_rates.append(done / timed.seconds)
-            shares.append(1.0 - timed.seconds / elapsed)
+            physics_rates.append(done / timed.step_seconds)
+            shares.append(1.0 - (timed.step_seconds + timed.reset_seconds) / elapsed)
     finally:
-        environment.simulation = simulation
+        environment.simulation = environment.randomizer.simulation = simulation
     return {
         "physics_steps_per_second": mean_figure(physics_rates, "1/s"),
         "environment_steps_per_second": mean_figure(environment_rates, "1/s"),
