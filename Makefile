@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PLANNER ?= scripted
+PLANNER ?= checkpoints/highlevel/lift-box
 OUTPUT ?= reports/demo
 
 .PHONY: setup demo test format clean
