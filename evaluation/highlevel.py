@@ -27,6 +27,7 @@ from evaluation.reports import (
     write_results,
 )
 from evaluation.statistics import Figure, mean_figure, share_figure
+from evaluation.sweeps import SweepResult, report_lines, run_sweep, sweep_figures, write_plots
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.episodes import EpisodeRecord, Policy, run_episodes
 from highlevel.planner import Planner, planner_hash
@@ -61,6 +62,10 @@ class Arguments:
     """Also run the task's negative controls, which must all fail."""
     control_episodes: int = 100
     """Episodes of each negative control."""
+    sweeps: bool = False
+    """Also map success over the conditions that the task names, such as mass and size."""
+    sweep_episodes: int = 100
+    """Episodes of each cell of a sweep."""
     output: Path = Path("runs/evaluation/highlevel")
     """Folder for report.md, metrics.json and plots; files of an earlier report there are replaced."""
     robots: int = ROBOTS
@@ -81,6 +86,7 @@ class Evaluation:
     stages: tuple[str, ...]
     records: list[EpisodeRecord]
     controls: dict[str, list[EpisodeRecord]]
+    sweeps: list[SweepResult]
     seconds: float
     """Time the evaluation took [s]."""
 
@@ -92,7 +98,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _run(arguments: Arguments) -> None:
-    for name in ("episodes", "control_episodes", "robots", "threads"):
+    for name in ("episodes", "control_episodes", "sweep_episodes", "robots", "threads"):
         if getattr(arguments, name) < 1:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
     task = load_task(arguments.task)
@@ -110,37 +116,53 @@ def _run(arguments: Arguments) -> None:
 
 
 def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
-    """Run the episodes and, if wanted, the negative controls, each from the first episode of the seed on."""
+    """Run the episodes and, if wanted, negative controls and sweeps, each from the first episode of the seed on."""
     began = time.monotonic()
     task = load_task(arguments.task)
-    runs: dict[str, tuple[Task, int]] = {"": (task, arguments.episodes)}
-    if arguments.controls:
-        for name in control_names(task):
-            runs[name] = (with_control(task, name), arguments.control_episodes)
-    results: dict[str, list[EpisodeRecord]] = {}
+    if arguments.sweeps and not task.sweeps:
+        raise ValueError(f"the task {task.name!r} has no sweeps: leave out --sweeps")
+    names = control_names(task) if arguments.controls else ()
+    sweeps = task.sweeps if arguments.sweeps else ()
+    total = arguments.episodes + len(names) * arguments.control_episodes
+    total += sum(sweep.size for sweep in sweeps) * arguments.sweep_episodes
     with ProgressReport() as progress:
-        bar = progress.add_task("episodes", total=sum(count for _, count in runs.values()))
+        bar = progress.add_task("episodes", total=total)
         finished = 0
-        for name, (variant, count) in runs.items():
-            progress.update(bar, description=name.replace("_", " ") or "episodes")
+
+        def run(variant: Task, count: int) -> list[EpisodeRecord]:
+            nonlocal finished
+            before = finished
             physics = PhysicsConfig(num_threads=arguments.threads)
             environment = CommandEnvironment(variant, controller, arguments.robots, physics=physics)
             policy = make_policy(arguments.planner, environment, controller)
-            before = finished
-
-            def show(over: int, before: int = before) -> None:
-                progress.update(bar, completed=before + over)
-
-            results[name] = run_episodes(environment, policy, count, arguments.seed, on_progress=show)
+            records = run_episodes(
+                environment,
+                policy,
+                count,
+                arguments.seed,
+                on_progress=lambda over: progress.update(bar, completed=before + over),
+            )
             finished += count
+            return records
+
+        records = run(task, arguments.episodes)
+        controls = {}
+        for name in names:
+            progress.update(bar, description=name.replace("_", " "))
+            controls[name] = run(with_control(task, name), arguments.control_episodes)
+        swept = []
+        for sweep in sweeps:
+            progress.update(bar, description=sweep.name.replace("_", " "))
+            swept.append(run_sweep(task, sweep, lambda variant: run(variant, arguments.sweep_episodes)))
     identity = None if arguments.planner == SCRIPTED else planner_hash(arguments.planner)
     return Evaluation(
         arguments=arguments,
         controller=content_hash(controller),
         planner=identity,
         stages=task.stages,
-        records=results.pop(""),
-        controls=results,
+        records=records,
+        controls=controls,
+        sweeps=swept,
         seconds=time.monotonic() - began,
     )
 
@@ -215,7 +237,7 @@ def all_figures(evaluation: Evaluation) -> dict[str, Figure]:
         for name in ("full", "lift_up", "fall_rate"):
             if name in controlled:
                 figures[f"{name}_{control}"] = controlled[name]
-    return figures
+    return figures | sweep_figures(evaluation.sweeps)
 
 
 # -- report --------------------------------------------------------------------------------------------------
@@ -230,6 +252,7 @@ def write_report(folder: Path, evaluation: Evaluation) -> None:
     if failures:
         panels["share that failed by"] = failures
     plot_bars(folder / "stages.png", panels, columns=2)
+    write_plots(folder, evaluation.sweeps)
     (folder / REPORT_FILE).write_text(report_text(evaluation, figures))
     write_json(folder / EPISODES_FILE, [asdict(record) for record in evaluation.records])
     content = metrics(
@@ -293,6 +316,8 @@ def report_text(evaluation: Evaluation, figures: dict[str, Figure]) -> str:
             "",
             _control_table(evaluation, figures),
         ]
+    if evaluation.sweeps:
+        lines += report_lines(evaluation.sweeps)
     return "\n".join(lines)
 
 

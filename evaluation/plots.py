@@ -81,15 +81,24 @@ def plot_overlays(
     _save(canvas, path)
 
 
-def plot_heat_map(path: Path, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
-    """``values`` (rows, columns) with their numbers written in; NaN stays blank."""
+def plot_heat_map(
+    path: Path,
+    values: np.ndarray,
+    rows: Sequence[str],
+    columns: Sequence[str],
+    title: str,
+    decimals: int = 3,
+    limits: tuple[float, float] | None = None,
+) -> None:
+    """``values`` (rows, columns) with their numbers written in; NaN stays blank. ``limits`` of the colours."""
+    low, high = (None, None) if limits is None else limits
     canvas, axis = pyplot.subplots(figsize=(1.6 + 1.1 * len(columns), 1.4 + 0.5 * len(rows)))
-    image = axis.imshow(values, cmap="coolwarm", aspect="auto")
+    image = axis.imshow(values, cmap="coolwarm", aspect="auto", vmin=low, vmax=high)
     axis.set_xticks(range(len(columns)), columns)
     axis.set_yticks(range(len(rows)), rows)
     for (row, column), value in np.ndenumerate(values):
         if np.isfinite(value):
-            axis.text(column, row, f"{value:.3f}", ha="center", va="center", fontsize=9)
+            axis.text(column, row, f"{value:.{decimals}f}", ha="center", va="center", fontsize=9)
     axis.set_title(title, fontsize=10)
     canvas.colorbar(image)
     _save(canvas, path)

@@ -10,6 +10,7 @@ import importlib
 import importlib.util
 import pkgutil
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -66,6 +67,31 @@ class Decision:
     """Their difference in units of the largest change of one decision."""
 
 
+@dataclass(frozen=True)
+class SweepAxis:
+    """One quantity of a task's configuration and the values that an evaluation gives it."""
+
+    label: str
+    """With the unit."""
+    values: tuple[float, ...]
+    fix: Callable[[Any, float], Any]
+    """The configuration with the quantity fixed at a value."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Success over a grid of conditions, everything else drawn as always."""
+
+    name: str
+    rows: SweepAxis
+    columns: SweepAxis | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return len(self.rows.values) * (1 if self.columns is None else len(self.columns.values))
+
+
 class Task(ABC):
     """A task for N robots at once. The environment owns the robots, the task owns everything else in the
     scene.
@@ -86,6 +112,8 @@ class Task(ABC):
     """What the paper's planner sees of the object; it comes first in the observation."""
     added_blocks: tuple[ObservationBlock, ...]
     """Additions to the paper's observation; they come last."""
+    sweeps: tuple[Sweep, ...] = ()
+    """Conditions over which an evaluation can map success; the task then has a ``config`` and is made from one."""
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:

@@ -26,8 +26,8 @@ class SpawnConfig:
     """Height of the block [m]."""
     distance: Range = (0.8, 2.0)
     """From the pelvis to the near face of the box [m]."""
-    bearing: float = 0.785
-    """Half range of the direction of the box seen from the robot [rad]."""
+    bearing: Range = (-0.785, 0.785)
+    """Heading of the robot against its line of sight to the box [rad]."""
     box_yaw: float = 0.52
     """Half range of the box's yaw against the line of sight [rad]."""
 
@@ -40,6 +40,16 @@ class NoiseConfig:
     """Half range, per axis [m]."""
     angle: float = 0.05
     """Half range, about each axis [rad]."""
+
+
+@dataclass(frozen=True)
+class PushConfig:
+    """Pushes during an episode; none by default."""
+
+    velocity: float = 0.0
+    """Change of the pelvis' velocity, in a random horizontal direction [m/s]."""
+    interval: float = 3.0
+    """Time between pushes [s]."""
 
 
 @dataclass(frozen=True)
@@ -119,5 +129,6 @@ class LiftBoxConfig:
     """``frictionless``: palms without friction; ``no_hands``: palms that touch nothing."""
     spawn: SpawnConfig = field(default_factory=SpawnConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
+    push: PushConfig = field(default_factory=PushConfig)
     stages: StageConfig = field(default_factory=StageConfig)
     rewards: RewardConfig = field(default_factory=RewardConfig)

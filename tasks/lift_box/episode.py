@@ -77,7 +77,7 @@ def draw(config: LiftBoxConfig, seed: int, number: Tensor) -> tuple[Episode, Sta
         angle_bias=2.0 * random[:, 17:20] - 1.0,
     )
     sight = between(7, -spawn.box_yaw, spawn.box_yaw)
-    bearing = between(8, -spawn.bearing, spawn.bearing)
+    bearing = between(8, *spawn.bearing)
     distance = between(9, *spawn.distance) + 0.5 * size[:, 0]
     position = -distance[:, None] * torch.stack([torch.cos(sight), torch.sin(sight)], -1)
     return episode, Start(position, sight + bearing)

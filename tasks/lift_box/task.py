@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict
 from typing import Any
 
@@ -22,8 +23,9 @@ from tasks.lift_box.geometry import Situation, observe_situation, relative_pose,
 from tasks.lift_box.reward import costs, potential
 from tasks.lift_box.scene import BOX, FORCE_SENSORS, BoxProperties, add_box_scene
 from tasks.lift_box.stages import HOLD, STAGES, Progress, advance, failure_name
+from tasks.lift_box.sweeps import SWEEPS
 
-_NOISE_STREAM = 2
+_NOISE_STREAM, _PUSH_STREAM = 2, 3
 
 
 class LiftBox(Task):
@@ -35,6 +37,7 @@ class LiftBox(Task):
 
     name = "lift_box"
     stages = STAGES
+    sweeps = SWEEPS
     object_blocks = (
         ObservationBlock("box_position", 3, 1.0),
         ObservationBlock("box_rotation", 6, 1.0),
@@ -100,6 +103,7 @@ class LiftBox(Task):
     def step(self, measured: Measurement, decision: Decision) -> Outcome:
         rewards, stages, period = self.config.rewards, self.config.stages, self._simulation.control_period
         self._control_steps += 1
+        self._push()
         situation = self.situation = self.look(measured)
         support = self.episode.support_height
         advance(self.progress, situation, support, stages, period)
@@ -113,6 +117,19 @@ class LiftBox(Task):
         reward = gained + per_decision / self.action.decision_steps
         reward = reward + rewards.success * success + rewards.drop * dropped
         return Outcome(reward, success, dropped)
+
+    def _push(self) -> None:
+        push = self.config.push
+        if push.velocity == 0.0:
+            return
+        due = self._control_steps % round(push.interval / self._simulation.control_period) == 0
+        angle = 2.0 * math.pi * uniform(self._seed, self._moment(), _PUSH_STREAM, 1)[:, 0]
+        change = push.velocity * torch.stack([torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)], dim=1)
+        self._simulation.push(change * due[:, None])
+
+    def _moment(self) -> Tensor:
+        """A number for every control step of every episode (N,), to draw by."""
+        return self._number * 100_000 + self._control_steps
 
     def look(self, measured: Measurement) -> Situation:
         # The force that each hand exerts on the box; the tests pin the sign.
@@ -158,8 +175,7 @@ class LiftBox(Task):
     def _pose_noise(self) -> tuple[Tensor, Tensor]:
         """Errors of the observed box position [m] and attitude [rad], each (N, 3); new at every decision."""
         noise = self.config.noise
-        moment = self._number * 100_000 + self._control_steps
-        fresh = 2.0 * uniform(self._seed, moment, _NOISE_STREAM, 6) - 1.0
+        fresh = 2.0 * uniform(self._seed, self._moment(), _NOISE_STREAM, 6) - 1.0
         shift = 0.5 * noise.position * (fresh[:, :3] + self.episode.position_bias)
         turn = 0.5 * noise.angle * (fresh[:, 3:] + self.episode.angle_bias)
         return shift, turn

@@ -13,7 +13,7 @@ import torch
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from lowlevel.rotations import yaw_of
 from robots.g1.constants import HAND_BODIES
-from tasks.lift_box.config import LiftBoxConfig, SpawnConfig
+from tasks.lift_box.config import LiftBoxConfig, PushConfig, SpawnConfig
 from tasks.lift_box.episode import draw
 from tasks.lift_box.scene import BOX, FORCE_SENSORS, HAND_GEOMS, SUPPORT
 from tasks.lift_box.task import LiftBox
@@ -45,7 +45,7 @@ def test_episodes_start_within_the_spawn_ranges() -> None:
     assert spawn.distance[0] <= distance.min() and distance.max() <= spawn.distance[1]
     sight = torch.atan2(-start.position[:, 1], -start.position[:, 0])
     bearing = torch.atan2(torch.sin(start.heading - sight), torch.cos(start.heading - sight))
-    assert sight.abs().max() <= spawn.box_yaw and bearing.abs().max() <= spawn.bearing
+    assert sight.abs().max() <= spawn.box_yaw and spawn.bearing[0] <= bearing.min() <= bearing.max() <= spawn.bearing[1]
     on_floor = (episode.support_height == 0.0).float().mean().item()
     assert abs(on_floor - spawn.floor_share) < 0.03
     assert abs(episode.mass.mean().item() - 1.25) < 0.03
@@ -129,6 +129,27 @@ def test_hand_forces_point_at_the_box_and_count_only_its_contacts(make: Make) ->
     assert environment.measured is not None
     seen = task.look(environment.measured)
     assert seen.palm_force[0, 0] > 1.0 and seen.palm_force[0, 1] == 0.0
+
+
+def test_pushes_come_when_they_are_due_and_in_all_directions(make: Make) -> None:
+    changes = {}
+    for velocity in (0.0, 0.5):
+        environment = make(4, LiftBoxConfig(push=PushConfig(velocity, interval=0.2)))
+        environment.reset(seed=2)
+        before = []
+        push = environment.simulation.push
+        environment.simulation.push = lambda change, push=push, before=before: (before.append(change), push(change))
+        for _ in range(4):
+            environment.step(environment.action_map.action(environment.command))
+        changes[velocity] = before
+    assert not changes[0.0]
+    pushed = torch.stack(changes[0.5])
+    speed = pushed.norm(dim=2)
+    due = torch.arange(1, 21) % 10 == 0
+    assert not speed[~due].any() and pushed[..., 2].eq(0.0).all()
+    torch.testing.assert_close(speed[due], torch.full((2, 4), 0.5))
+    angles = torch.atan2(pushed[due][..., 1], pushed[due][..., 0]).flatten()
+    assert angles.unique().numel() == 8
 
 
 def test_nothing_succeeds_at_reset_and_rewards_are_finite(make: Make) -> None:
