@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from evaluation.sweeps import SweepResult, cells, report_lines, run_sweep, sweep_figures, write_plots
+from evaluation.sweeps import cells, report_lines, run_sweep, sweep_figures, write_plots
 from highlevel.episodes import EpisodeRecord
 from highlevel.task import Sweep, SweepAxis, Task, load_task
 from tasks.lift_box.config import LiftBoxConfig, SpawnConfig
@@ -43,7 +43,7 @@ def test_a_cell_fixes_its_quantities_and_draws_the_rest_as_always() -> None:
 
 
 def test_results_are_tabled_and_drawn(tmp_path: Path) -> None:
-    sweep = Sweep("mass_edge", *(SWEEPS[0].rows, SWEEPS[0].columns))
+    sweep = SWEEPS[0]
 
     def run(variant: Task) -> list[EpisodeRecord]:
         config: Any = variant.config  # type: ignore[attr-defined]
@@ -65,8 +65,6 @@ def test_results_are_tabled_and_drawn(tmp_path: Path) -> None:
 
 def test_a_sweep_of_one_quantity_has_one_column() -> None:
     sweep = Sweep("push", SweepAxis("pushes", (0.0, 1.0), lambda config, _: config))
-    figure = sweep_figures(
-        [run_sweep(load_task("lift_box"), sweep, lambda _: [EpisodeRecord(0, True, 6, None, 9.0, 0.0)])]
-    )
-    assert list(figure) == ["full_push_0", "full_push_1"]
-    assert SweepResult(sweep, ()).column_labels == ["full success"]
+    result = run_sweep(load_task("lift_box"), sweep, lambda _: [EpisodeRecord(0, True, 6, None, 9.0, 0.0)])
+    assert list(sweep_figures([result])) == ["full_push_0", "full_push_1"]
+    assert result.column_labels == ["full success"]
