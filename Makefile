@@ -31,4 +31,4 @@ format: setup
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) runs reports
+	rm -rf $(VENV)

@@ -25,7 +25,7 @@ from tasks.lift_box.scene import BOX, FORCE_SENSORS, BoxProperties, add_box_scen
 from tasks.lift_box.stages import HOLD, STAGES, Progress, advance, failure_name
 from tasks.lift_box.sweeps import SWEEPS
 
-_NOISE_STREAM, _PUSH_STREAM = 2, 3
+_NOISE_STREAM, _PUSH_STREAM = 2, 4
 
 
 class LiftBox(Task):
