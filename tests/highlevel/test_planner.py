@@ -17,6 +17,8 @@ from highlevel.action import ActionConfig
 from highlevel.environment import CommandEnvironment
 from highlevel.planner import PLANNER_FILE, WEIGHTS_FILE, Planner, PlannerConfig, PlannerError, planner_hash
 from highlevel.policy import PlannerActor, PlannerNetwork, policy_arguments
+from highlevel.registration import find_controller
+from highlevel.task import load_task
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.controller import content_hash
 
@@ -113,3 +115,10 @@ def test_another_action_range_is_refused(planner: Planner, make_environment: Mak
     other = Planner(replace(planner.config, action=ActionConfig(yaw=0.5)), planner.actor, {})
     with pytest.raises(PlannerError, match="another observation or action"):
         other.require_environment(make_environment())
+
+
+def test_the_shipped_planner_belongs_to_the_shipped_controller_and_task() -> None:
+    checkpoints = Path(__file__).resolve().parents[2] / "checkpoints"
+    controller = find_controller(None)
+    planner = Planner.load(checkpoints / "highlevel" / "lift-box", controller)
+    planner.require_environment(CommandEnvironment(load_task(planner.config.task), controller, 1))
