@@ -8,15 +8,11 @@ Nothing in it is pickled.
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 from torch import Tensor
 
 from highlevel.action import ActionConfig
@@ -25,8 +21,7 @@ from highlevel.policy import PlannerActor
 from highlevel.task import ObservationBlock
 from lowlevel.commands import COMMAND_SIZE
 from lowlevel.controller import content_hash
-from lowlevel.files import atomic_write
-from lowlevel.plain import from_plain
+from lowlevel.frozen_folder import FrozenFolder
 
 FORMAT_VERSION = 1
 PLANNER_FILE, WEIGHTS_FILE = "planner.json", "weights.safetensors"
@@ -34,6 +29,16 @@ PLANNER_FILE, WEIGHTS_FILE = "planner.json", "weights.safetensors"
 
 class PlannerError(ValueError):
     """A planner folder cannot be used; the message says why and what to do."""
+
+
+_FOLDER = FrozenFolder(
+    kind="planner",
+    version=FORMAT_VERSION,
+    description_file=PLANNER_FILE,
+    weights_file=WEIGHTS_FILE,
+    example="checkpoints/highlevel",
+    error=PlannerError,
+)
 
 
 @dataclass(frozen=True)
@@ -75,22 +80,12 @@ class Planner:
         """Load a planner folder, and check that it belongs to the folder of a ``controller`` if one is given.
 
         Raises:
-            PlannerError: if a file is missing, damaged, of another version, holds weights that are not
-            finite, or
+            PlannerError: if a file is missing, damaged, of another version, holds weights that are not finite, or
                 belongs to another controller.
         """
         folder = Path(folder)
-        description = _read_json(folder)
-        path = folder / PLANNER_FILE
-        version = description.get("format_version")
-        if version != FORMAT_VERSION:
-            raise PlannerError(f"{path} has format version {version}, this code reads {FORMAT_VERSION}")
-        try:
-            config = from_plain(PlannerConfig, description["config"])
-            provenance = description["provenance"]
-        except (KeyError, TypeError, ValueError) as error:
-            raise PlannerError(f"{path} is incomplete: {error}") from error
-        tensors = _read_weights(folder)
+        config, provenance = _FOLDER.read_config(folder, PlannerConfig)
+        tensors = _FOLDER.read_weights(folder)
         size = sum(block.size for block in config.observation)
         actor = PlannerActor(size, COMMAND_SIZE, config.hidden)
         try:
@@ -129,53 +124,15 @@ class Planner:
             raise PlannerError("this planner was trained with another observation or action: train it again")
 
     def save(self, folder: Path | str) -> None:
-        """Write the folder; each file is complete or absent."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        tensors = {name: tensor.contiguous() for name, tensor in self.actor.state_dict().items()}
-        for name, tensor in tensors.items():
-            if not torch.isfinite(tensor).all():
-                raise PlannerError(f"the planner's {name!r} is not finite: it is not saved")
-        atomic_write(folder / WEIGHTS_FILE, lambda file: file.write(save(tensors)))
-        description = {
-            "format_version": FORMAT_VERSION,
-            "config": asdict(self.config),
-            "provenance": self.provenance,
-        }
-        text = json.dumps(description, indent=1)
-        atomic_write(folder / PLANNER_FILE, lambda file: file.write(text.encode()))
+        """Write the folder; each file is complete or absent.
+
+        Raises:
+            PlannerError: if a weight is not finite; nothing is written then.
+        """
+        _FOLDER.write_weights(Path(folder), self.actor.state_dict())
+        _FOLDER.write_description(Path(folder), self.config, self.provenance)
 
 
 def planner_hash(folder: Path | str) -> str:
     """Identity of a planner: SHA-256 over configuration and weights, 16 hexadecimal digits."""
-    digest = hashlib.sha256()
-    digest.update(json.dumps(_read_json(Path(folder))["config"], sort_keys=True).encode())
-    digest.update((Path(folder) / WEIGHTS_FILE).read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _read_json(folder: Path) -> dict[str, Any]:
-    path = folder / PLANNER_FILE
-    if not path.is_file():
-        raise PlannerError(f"{path} is missing: give a planner folder, such as one under checkpoints/highlevel")
-    try:
-        content = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise PlannerError(f"{path} is damaged: {error}") from error
-    if not isinstance(content, dict):
-        raise PlannerError(f"{path} is damaged: it does not hold a JSON object")
-    return content
-
-
-def _read_weights(folder: Path) -> dict[str, Tensor]:
-    path = folder / WEIGHTS_FILE
-    if not path.is_file():
-        raise PlannerError(f"{path} is missing: copy the whole planner folder")
-    try:
-        tensors = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise PlannerError(f"{path} is damaged or truncated: {error}") from error
-    for name, tensor in tensors.items():
-        if not torch.isfinite(tensor).all():
-            raise PlannerError(f"{path} holds numbers in {name!r} that are not finite: train the planner again")
-    return tensors
+    return _FOLDER.identity(Path(folder))

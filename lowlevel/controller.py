@@ -1,6 +1,7 @@
 """The frozen controller: whole-body commands in, PD joint targets out, at 50 Hz, for any number of robots.
 
-A controller is a folder. Nothing but this folder is needed to run it, and nothing in it is pickled:
+A controller is a folder. Beside this package nothing else is needed to run it, and nothing in it is pickled; its ONNX
+file needs nothing but ONNX Runtime:
 
 ``controller.json``      every convention at full precision, and where the controller comes from
 ``weights.safetensors``  policy weights, normaliser and nominal-pose table
@@ -10,22 +11,20 @@ A controller is a folder. Nothing but this folder is needed to run it, and nothi
 
 from __future__ import annotations
 
-import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidArgument, InvalidGraph, InvalidProtobuf
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 from torch import Tensor
 
 from lowlevel.commands import CommandSpace
 from lowlevel.control_step import ControlStep, Memory
 from lowlevel.files import atomic_write
+from lowlevel.frozen_folder import FrozenFolder
 from lowlevel.golden import GOLDEN_ROBOTS, golden_vectors
 from lowlevel.networks import NetworkConfig, ObservationSizes, PilotActor
 from lowlevel.nominal import NominalConfig, NominalMotion
@@ -37,7 +36,6 @@ from lowlevel.observation import (
     normalised_columns,
 )
 from lowlevel.onnx_step import OnnxStep, export_step
-from lowlevel.plain import from_plain
 from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
@@ -53,6 +51,16 @@ CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
 
 class ControllerError(ValueError):
     """A controller folder cannot be used; the message says which file is at fault and why."""
+
+
+_FOLDER = FrozenFolder(
+    kind="controller",
+    version=FORMAT_VERSION,
+    description_file=CONFIG_FILE,
+    weights_file=WEIGHTS_FILE,
+    example="checkpoints/lowlevel",
+    error=ControllerError,
+)
 
 
 @dataclass(frozen=True)
@@ -154,13 +162,6 @@ class Controller:
             raise RuntimeError("call reset() first")
         return self._memory.reference
 
-    @property
-    def gait_phase(self) -> Tensor:
-        """Gait phase (N,) [rad] of the next step."""
-        if self._memory is None:
-            raise RuntimeError("call reset() first")
-        return self._memory.phase
-
     def twin(self, num_robots: int) -> Controller:
         """A controller on the CPU with copies of the weights and a fresh memory for ``num_robots`` robots."""
         pose = self.motion.pose
@@ -205,19 +206,10 @@ class Controller:
         if runtime not in ("torch", "onnx"):
             raise ControllerError(f"there is no runtime {runtime!r}: use 'torch' or 'onnx'")
         folder = Path(folder)
-        description = _read_json(folder, CONFIG_FILE)
-        version = description.get("format_version")
-        if version != FORMAT_VERSION:
-            raise ControllerError(
-                f"{folder / CONFIG_FILE} has format version {version}, this code reads {FORMAT_VERSION}"
-            )
-        try:
-            config = from_plain(ControllerConfig, description["config"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise ControllerError(f"{folder / CONFIG_FILE} is incomplete: {error}") from error
+        config, provenance = _FOLDER.read_config(folder, ControllerConfig)
         if config.joint_names != JOINT_NAMES:
             raise ControllerError(f"{folder / CONFIG_FILE} is for a robot with other joints or another joint order")
-        tensors = _read_weights(folder)
+        tensors = _FOLDER.read_weights(folder)
         actor = PilotActor(actor_sizes(), config.network, ~normalised_columns(FRAME))
         try:
             pose_tensors = [tensors.pop(f"nominal_pose.{name}").to(device) for name in _POSE_TENSORS]
@@ -230,7 +222,7 @@ class Controller:
             raise ControllerError(f"{folder / WEIGHTS_FILE} does not fit {CONFIG_FILE}: {first_line}") from error
         pose = NominalPose(config.pose_axes, *pose_tensors)
         session = _read_onnx(folder, device) if runtime == "onnx" else None
-        return cls(config, actor, pose, description["provenance"], device, session)
+        return cls(config, actor, pose, provenance, device, session)
 
     def save(self, folder: Path | str, golden_seed: int = 0) -> None:
         """Write the folder: JSON, weights, ONNX and golden vectors; each file is complete or absent.
@@ -238,25 +230,15 @@ class Controller:
         Raises:
             ControllerError: if a weight is not finite; nothing is written then.
         """
-        for name, tensor in self.actor.state_dict().items():
-            if not torch.isfinite(tensor).all():
-                raise ControllerError(f"weight {name!r} is not finite: nothing was written to {folder}")
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        pose = {f"nominal_pose.{name}": getattr(self.motion.pose, name).cpu() for name in _POSE_TENSORS}
-        weights = {name: tensor.cpu().contiguous() for name, tensor in self.actor.state_dict().items()}
-        atomic_write(folder / WEIGHTS_FILE, lambda file: file.write(save(weights | pose)))
+        pose = {f"nominal_pose.{name}": getattr(self.motion.pose, name) for name in _POSE_TENSORS}
+        _FOLDER.write_weights(folder, self.actor.state_dict() | pose)
         twin = self.twin(GOLDEN_ROBOTS)
         golden = golden_vectors(twin, self.config.command_space, golden_seed)
         export_step(twin.step, self.config.command_space, folder / ONNX_FILE)
         atomic_write(folder / GOLDEN_FILE, lambda file: file.write(json.dumps(golden).encode()))
-        description = {
-            "format_version": FORMAT_VERSION,
-            "config": asdict(self.config),
-            "observation_layout": observation_layout(),
-            "provenance": self.provenance,
-        }
-        atomic_write(folder / CONFIG_FILE, lambda file: file.write(json.dumps(description, indent=1).encode()))
+        layout = observation_layout()
+        _FOLDER.write_description(folder, self.config, self.provenance, observation_layout=layout)
 
 
 _POSE_TENSORS = ("values", "roll_limit", "pitch_limits")
@@ -278,32 +260,12 @@ def observation_layout() -> list[dict[str, Any]]:
 
 def content_hash(folder: Path | str) -> str:
     """Identity of a controller: SHA-256 over configuration and weights, 16 hexadecimal digits."""
-    digest = hashlib.sha256()
-    description = _read_json(Path(folder), CONFIG_FILE)
-    digest.update(json.dumps(description["config"], sort_keys=True).encode())
-    digest.update((Path(folder) / WEIGHTS_FILE).read_bytes())
-    return digest.hexdigest()[:16]
+    return _FOLDER.identity(Path(folder))
 
 
 def add_metrics(folder: Path | str, metrics: dict[str, Any]) -> None:
     """Write measured figures into ``controller.json``; the identity does not change."""
-    path = Path(folder) / CONFIG_FILE
-    description = _read_json(Path(folder), CONFIG_FILE)
-    description["provenance"] = description["provenance"] | {"metrics": metrics}
-    atomic_write(path, lambda file: file.write(json.dumps(description, indent=1).encode()))
-
-
-def _read_json(folder: Path, name: str) -> dict[str, Any]:
-    path = folder / name
-    if not path.is_file():
-        raise ControllerError(f"{path} is missing: give a controller folder, such as one under checkpoints/lowlevel")
-    try:
-        content = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ControllerError(f"{path} is damaged: {error}") from error
-    if not isinstance(content, dict):
-        raise ControllerError(f"{path} is damaged: it does not hold a JSON object")
-    return content
+    _FOLDER.add_provenance(Path(folder), metrics=metrics)
 
 
 def _read_onnx(folder: Path, device: torch.device | str) -> OnnxStep:
@@ -316,17 +278,3 @@ def _read_onnx(folder: Path, device: torch.device | str) -> OnnxStep:
         return OnnxStep(path)
     except (Fail, InvalidArgument, InvalidGraph, InvalidProtobuf) as error:
         raise ControllerError(f"{path} is damaged or truncated: {error}") from error
-
-
-def _read_weights(folder: Path) -> dict[str, Tensor]:
-    path = folder / WEIGHTS_FILE
-    if not path.is_file():
-        raise ControllerError(f"{path} is missing: copy the whole controller folder")
-    try:
-        tensors = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise ControllerError(f"{path} is damaged or truncated: {error}") from error
-    for name, tensor in tensors.items():
-        if not torch.isfinite(tensor).all():
-            raise ControllerError(f"{path} holds numbers in {name!r} that are not finite: export the controller again")
-    return tensors
