@@ -67,6 +67,11 @@ def sum_over_ranks(values: Tensor) -> Tensor:
     return total
 
 
+def any_rank(flag: bool) -> bool:
+    """Whether ``flag`` is true on at least one rank; all ranks must ask."""
+    return bool(sum_over_ranks(torch.tensor(float(flag))) > 0)
+
+
 def average_over_ranks(tensors: Sequence[Tensor]) -> None:
     """Replace each tensor, in place, by its mean over ranks, with one all-reduce of their concatenation."""
     if world_size() == 1 or not tensors:

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from lowlevel.curriculum import Curriculum, CurriculumConfig
-from lowlevel.distributed import average_over_ranks, rank, world_size
+from lowlevel.distributed import any_rank, average_over_ranks, rank, world_size
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
 from lowlevel.files import atomic_write
 from lowlevel.interrupts import stop_on_signals
@@ -127,7 +127,8 @@ class Trainer:
         progress = ProgressReport(hidden=rank() != 0)
         task = progress.add_task("starting", total=self.config.total_steps, completed=self.steps)
         with stop_on_signals(self._request_stop), progress, self._log() as log:
-            while self.steps < self.config.total_steps and not self._stop_requested:
+            # A rank that stopped alone would leave the others waiting for it in their next all-reduce.
+            while self.steps < self.config.total_steps and not any_rank(self._stop_requested):
                 started = time.monotonic()
                 figures = self.iterate()
                 seconds = time.monotonic() - started
@@ -146,7 +147,7 @@ class Trainer:
 
     def iterate(self) -> dict[str, float]:
         """One rollout and one update; returns figures to log."""
-        terms, tracking = Averages(), Averages()
+        terms, tracking, falls = Averages(), Averages(), Averages()
         started = time.monotonic()
         for _ in range(self.config.ppo.steps_per_update):
             action = self.ppo.act(self.observation)
@@ -154,14 +155,15 @@ class Trainer:
             self.ppo.record(result.reward, result.terminated, result.truncated, result.next_privileged)
             self.observation = result.observation
             terms.add(result.terms | {"total": result.reward / self.environment.control_period})
+            falls.add({"share": result.terminated})
             tracking.add(_tracking(result))
         collection_seconds = time.monotonic() - started
         losses = self.ppo.update(self.observation)
         self.steps += self._steps_per_iteration
 
         mean_terms = terms.take()
-        falls = mean_terms.get("termination", 0.0)
-        self.fall_rate += 0.1 * (falls - self.fall_rate) if self.ppo.updates > 1 else falls - 1.0
+        share = falls.take()["share"]
+        self.fall_rate += 0.1 * (share - self.fall_rate) if self.ppo.updates > 1 else share - 1.0
         survived_steps = min(1.0 / max(self.fall_rate, 1e-9), float(self.environment.max_steps))
         self.curriculum.update(mean_terms, survived_steps / self.environment.max_steps)
         self.environment.open_range = self.curriculum.open_range
@@ -198,12 +200,14 @@ class Trainer:
     def load(self, path: Path, with_environment: bool = True) -> None:
         """Continue from a training state that :meth:`save` wrote; without its environment the robots start anew.
 
+        The state is rank 0's: the robots of other ranks always start anew.
+
         Raises:
             ValueError: if the file is damaged or belongs to another configuration.
         """
         state = read_training_state(path)
         self.load_learning(state)
-        if with_environment:
+        if with_environment and rank() == 0:
             self.environment.load_state_dict(state["environment"])
             self.observation = state["observation"]
         self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
