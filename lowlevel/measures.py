@@ -116,6 +116,14 @@ TRACKING_FIGURES: dict[str, tuple[str, Callable[[Measurement, Tensor], Tensor]]]
 """The paper's figures: name -> (unit, function of measurement and clamped command giving (N,))."""
 
 
+FALLEN_TILT = 0.9
+"""Angle between the torso's axis and where its reference has it, beyond which a robot counts as fallen [rad]."""
+FALLEN_DROP = 0.25
+"""Distance of the pelvis below its reference height beyond which it does [m]."""
+FALLEN_HEIGHT = 0.18
+"""Base height below which it always does [m]."""
+
+
 def has_fallen(measured: Measurement, reference: Tensor) -> Tensor:
     """Whether a robot is beyond saving (N,): torso far off its reference attitude, or pelvis far too low.
 
@@ -125,5 +133,5 @@ def has_fallen(measured: Measurement, reference: Tensor) -> Tensor:
     _, x, y, _ = multiply(conjugate(wanted), measured.torso_orientation).unbind(-1)
     # The cosine of the angle between the two vertical axes.
     tilt = torch.acos((1.0 - 2.0 * (x * x + y * y)).clamp(-1.0, 1.0))
-    too_low = measured.base_height < torch.clamp(reference[:, HEIGHT] - 0.25, min=0.18)
-    return (tilt > 0.9) | too_low
+    too_low = measured.base_height < (reference[:, HEIGHT] - FALLEN_DROP).clamp_min(FALLEN_HEIGHT)
+    return (tilt > FALLEN_TILT) | too_low
