@@ -23,7 +23,7 @@ from lowlevel.randomization import RandomizationConfig, Randomizer
 from lowlevel.rotations import from_roll_pitch_yaw
 from lowlevel.simulation import BatchSimulation
 from lowlevel.terrain import MAP_SIZE, Terrain, TerrainConfig
-from robots.g1.constants import DEFAULT_POSITION, FOOT_BODIES, GAINS, LOWER_JOINTS, NUM_JOINTS, joint_index
+from robots.g1.constants import DEFAULT_POSITION, GAINS, LOWER_JOINTS, NUM_JOINTS, joint_index
 from robots.g1.model import ModelOptions, build_spec
 
 BATCH = 32
@@ -138,7 +138,6 @@ class Arena:
         noise: observation noise.
         num_threads: physics threads.
         batch: robots simulated side by side (N).
-        visuals: load the visual meshes, for pictures and recordings.
 
     Raises:
         ValueError: if the controller's gains are none of the simulated robot's, or it runs at another rate.
@@ -151,16 +150,11 @@ class Arena:
         noise: NoiseConfig = NoiseConfig(),  # noqa: B008 (frozen)
         num_threads: int = 2,
         batch: int = BATCH,
-        visuals: bool = False,
     ) -> None:
         self.controller = controller
         self.batch = batch
         self.terrain = Terrain(terrain)
-        spec = build_spec(ModelOptions(gains=gain_set(controller), timestep=TIMESTEP, visuals=visuals))
-        for geom in spec.geoms:
-            # MuJoCo takes the larger friction of two geoms unless one has priority; here the feet's decides.
-            if geom.parent.name in FOOT_BODIES:
-                geom.priority = 1
+        spec = build_spec(ModelOptions(gains=gain_set(controller), timestep=TIMESTEP))
         self.terrain.add_to(spec)
         self.simulation = BatchSimulation(spec.compile(), batch, DECIMATION, num_threads)
         self.period = self.simulation.control_period

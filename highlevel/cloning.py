@@ -1,7 +1,7 @@
 """Behaviour cloning of demonstrations into a Stable-Baselines3 policy, actor and critic.
 
 The ``imitation`` package is tied to an older Stable-Baselines3, so the loss is written out: -log pi(a|s) for
-the actor and the squared error of the demonstrated returns for the critic. PPO after cloning is known to
+the actor and the Huber loss of the demonstrated returns for the critic. PPO after cloning is known to
 collapse when the critic has seen nothing (Stable-Baselines3 issue 543).
 """
 

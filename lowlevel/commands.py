@@ -41,11 +41,6 @@ class CommandSpace:
         """Lower and upper bounds, each (21,)."""
         return torch.tensor(self.lower, device=device), torch.tensor(self.upper, device=device)
 
-    def normalise(self, command: Tensor) -> Tensor:
-        """Map the bounds to [-1, 1]; fixed, so that a command held constant by the curriculum keeps its scale."""
-        lower, upper = self.bounds(command.device)
-        return (2.0 * command - (upper + lower)) / (upper - lower)
-
     def neutral(self, device: torch.device | str = "cpu") -> Tensor:
         """Stand upright at full height with the arms at the default pose (21,)."""
         command = torch.zeros(COMMAND_SIZE, device=device)

@@ -1,4 +1,4 @@
-"""From a training run to a frozen controller folder: ``python -m lowlevel.export RUN CONTROLLER``."""
+"""From a training run to a frozen controller folder: ``python -m lowlevel.export --run RUN --controller FOLDER``."""
 
 from __future__ import annotations
 

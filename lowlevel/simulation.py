@@ -1,6 +1,7 @@
 """N robots in ``mujoco.batch.Batch``: targets in, tensors of shape (N, ...) out.
 
-Nothing above this module touches MuJoCo's data structures, so that another engine can implement the same interface.
+Above this module only randomisation (through :meth:`BatchSimulation.per_robot`) and scenes (which are ``MjSpec``) know
+MuJoCo's data structures.
 Base and joint quantities are exact; those read from sensors (torso, feet, palms, forces) are one physics substep
 old, as after any ``mj_step``.
 """
@@ -17,7 +18,7 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from robots.g1.constants import HAND_BODIES, JOINT_NAMES, PELVIS_BODY, SIDES, TORSO_BODY
-from robots.g1.model import effort_limits, joint_limits
+from robots.g1.model import joint_limits
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,6 @@ class BatchSimulation:
         self.decimation = decimation
         self.device = torch.device(device)
         self.control_period = decimation * float(model.opt.timestep)
-        self.effort_limits = torch.tensor(effort_limits(model), dtype=torch.float32, device=device)
         limits = torch.tensor(joint_limits(model), dtype=torch.float32, device=device)
         self.joint_lower, self.joint_upper = limits[:, 0], limits[:, 1]
 
@@ -180,10 +180,6 @@ class BatchSimulation:
     def object_pose(self, body: str) -> Tensor:
         """Position and quaternion (N, 7) of a free body."""
         return self._tensor(self._qpos[:, self._free_joint_slices(body)[0]])
-
-    def object_velocity(self, body: str) -> Tensor:
-        """Linear (world) and angular (body) velocity (N, 6) of a free body."""
-        return self._tensor(self._qvel[:, self._free_joint_slices(body)[1]])
 
     def set_object_pose(self, ids: Tensor, body: str, pose: Tensor) -> None:
         """Place a free body at ``pose`` (n, 7), at rest."""

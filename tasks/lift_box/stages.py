@@ -33,8 +33,6 @@ class Progress:
     """Largest potential so far (N,)."""
     start_position: Tensor
     """Where the box stood (N, 2) [m]."""
-    peak_force: Tensor
-    """Largest normal force of a palm so far (N,) [N]."""
 
     @classmethod
     def empty(cls, count: int) -> Progress:
@@ -51,7 +49,6 @@ class Progress:
             hold_time=zeros(),
             best_potential=zeros(),
             start_position=zeros(2),
-            peak_force=zeros(),
         )
 
     def clear(self, ids: Tensor) -> None:
@@ -80,7 +77,6 @@ def advance(
     progress.touching = on | (progress.touching & off)
     both = progress.touching.all(dim=1)
     progress.contact_time = torch.where(both, progress.contact_time + period, 0.0)
-    progress.peak_force = torch.maximum(progress.peak_force, situation.palm_force.amax(dim=1))
     clearance = situation.bottom - support_height
 
     upright = (

@@ -44,8 +44,6 @@ def test_the_same_seed_gives_the_same_episodes_in_the_same_and_in_another_instan
 def test_an_episode_begun_in_the_middle_of_a_batch_equals_a_fresh_one(make_environment: Make) -> None:
     environment = make_environment(2)
     environment.reset(seed=1)
-    falling = torch.zeros(2, 21)
-    falling[0, 3], falling[0, 5] = -1.0, 1.0
     for step in range(150):
         result = environment.step(_actions(1, 2, step)[0])
         if bool(result.done[0]) and not bool(result.done[1]):

@@ -37,12 +37,6 @@ def test_has_a_name_unit_and_ordered_bounds_for_each_of_21_numbers(space: Comman
     assert all(low < high for low, high in zip(space.lower, space.upper, strict=True))
 
 
-def test_normalising_maps_the_bounds_to_plus_minus_one(space: CommandSpace) -> None:
-    lower, upper = space.bounds()
-    assert torch.allclose(space.normalise(lower), -torch.ones(21))
-    assert torch.allclose(space.normalise(upper), torch.ones(21))
-
-
 def test_samples_stay_inside_the_bounds_and_fill_them(space: CommandSpace) -> None:
     command, _ = draw(space, CommandRange())
     lower, upper = space.bounds()
