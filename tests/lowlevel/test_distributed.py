@@ -60,7 +60,8 @@ def _rank(rank: int, folder: str) -> None:
     distributed.average_over_ranks(mixed)
     different = torch.full((3,), float(rank))
     distributed.broadcast([different])
-    result |= {"mixed": mixed, "broadcast": different}
+    stops = [distributed.any_rank(rank == 1), distributed.any_rank(False)]
+    result |= {"mixed": mixed, "broadcast": different, "stops": stops}
     torch.save(result, f"{folder}/rank{rank}.pt")
     distributed.stop()
 
@@ -78,6 +79,7 @@ def test_two_ranks_learn_what_one_process_learns_from_all_robots(tmp_path: Path)
     for rank in (first, second):
         assert torch.equal(rank["mixed"][0], torch.full((2, 2), 0.5)) and float(rank["mixed"][1]) == 5.0
         assert torch.equal(rank["broadcast"], torch.zeros(3))
+        assert rank["stops"] == [True, False], "all ranks must stop when one is asked to"
     single = _learn(slice(0, ROBOTS))
     modules = ("actor", "critic", "target_encoder")
     expected = _flat({module: single["state"][module] for module in modules})  # type: ignore[index]
