@@ -97,7 +97,7 @@ class Task(ABC):
     scene.
 
     The order of calls: :meth:`add_to` once, :meth:`attach` once, then :meth:`reset` for robots that begin an
-    episode and :meth:`step` for all of them after every control step; :meth:`observe` at any time.
+    episode and :meth:`step` for all of them after every control step; the observations at any time.
     """
 
     name: str
@@ -158,9 +158,13 @@ class Task(ABC):
         """How each robot's episode would be classified if it ended now (N names), given who has ``fallen``
         (N,)."""
 
-    @abstractmethod
     def expert(self, environment: Any) -> Any:
-        """A scripted :class:`highlevel.episodes.Policy` for a ``CommandEnvironment`` of this task."""
+        """A scripted :class:`highlevel.episodes.Policy` for a ``CommandEnvironment`` of this task.
+
+        Raises:
+            ValueError: if the task has none, as by default.
+        """
+        raise ValueError(f"task {self.name!r} has no scripted expert: train it with --demonstrations 0")
 
 
 def task_names() -> list[str]:

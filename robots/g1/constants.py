@@ -91,6 +91,10 @@ SIDES = ("left", "right")
 
 SOLE_OFFSET = -0.035
 """Height of the sole in the ankle-roll frame [m]: the URDF's foot spheres, centre -0.030, radius 0.005."""
+SOLE_CENTER = 0.035
+"""Middle of the sole ahead of the ankle-roll frame [m]; the foot sites lie there."""
+PALM_HALF_THICKNESS = 0.012
+"""Of the palm plates [m]: the surface that touches lies this far from the palm centre along the palm normal."""
 PALM_OFFSET = (0.09, 0.0, 0.0)
 """Palm centre in the wrist-yaw frame [m]; the palm normal is -y on the left hand, +y on the right."""
 TOTAL_MASS = 33.341

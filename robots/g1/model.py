@@ -19,9 +19,11 @@ from robots.g1.constants import (
     GAINS,
     HAND_BODIES,
     JOINT_NAMES,
+    PALM_HALF_THICKNESS,
     PALM_OFFSET,
     PELVIS_BODY,
     SIDES,
+    SOLE_CENTER,
     SOLE_OFFSET,
     TORSO_BODY,
     urdf_path,
@@ -136,7 +138,7 @@ def _add_actuators(spec: mujoco.MjSpec, options: ModelOptions) -> None:
 def _add_feet(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     for side, body_name in zip(SIDES, FOOT_BODIES, strict=True):
         body = spec.body(body_name)
-        body.add_site(name=f"{side}_foot", pos=[0.035, 0.0, SOLE_OFFSET])
+        body.add_site(name=f"{side}_foot", pos=[SOLE_CENTER, 0.0, SOLE_OFFSET])
         for number, (x, y) in enumerate(_FOOT_SPHERES):
             sphere = body.add_geom(name=f"{side}_foot_{number}", type=mujoco.mjtGeom.mjGEOM_SPHERE)
             sphere.size = [_FOOT_SPHERE_RADIUS, 0, 0]
@@ -158,10 +160,10 @@ def _add_palms(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     for side, body_name in zip(SIDES, HAND_BODIES, strict=True):
         inwards = -1.0 if side == "left" else 1.0
         body = spec.body(body_name)
-        body.add_site(name=f"{side}_palm", pos=[PALM_OFFSET[0], inwards * 0.012, PALM_OFFSET[2]])
+        body.add_site(name=f"{side}_palm", pos=[PALM_OFFSET[0], inwards * PALM_HALF_THICKNESS, PALM_OFFSET[2]])
         parts = (
-            ("palm", [PALM_OFFSET[0], 0.0, 0.0], [0.05, 0.012, 0.045]),
-            ("wrist", [0.02, 0.0, 0.0], [0.03, 0.012, 0.025]),
+            ("palm", [PALM_OFFSET[0], 0.0, 0.0], [0.05, PALM_HALF_THICKNESS, 0.045]),
+            ("wrist", [0.02, 0.0, 0.0], [0.03, PALM_HALF_THICKNESS, 0.025]),
         )
         for part, position, half_size in parts:
             box = body.add_geom(name=f"{side}_{part}", type=mujoco.mjtGeom.mjGEOM_BOX)
@@ -190,7 +192,7 @@ def _add_self_collision(spec: mujoco.MjSpec) -> None:
             capsule.mass, capsule.contype, capsule.conaffinity, capsule.group = 0.0, 0, 0, 3
     for name in FOOT_BODIES:
         plate = spec.body(name).add_geom(name=f"{name}_plate", type=mujoco.mjtGeom.mjGEOM_BOX)
-        plate.pos, plate.size = [0.035, 0.0, -0.02], [0.085, 0.03, 0.012]
+        plate.pos, plate.size = [SOLE_CENTER, 0.0, -0.02], [0.085, 0.03, 0.012]
         plate.mass, plate.contype, plate.conaffinity, plate.group = 0.0, 0, 0, 3
     for side in SIDES:
         for arm_part in (f"{side}_palm", f"{side}_elbow_link_capsule"):

@@ -1,8 +1,7 @@
 """A scripted expert: a state machine per robot, run for all robots at once, that produces planner actions.
 
 It shows that the controller can do the task before anything is learnt, gives the demonstrations, and is the
-baseline. It sees the true state, including contact forces. The numbers follow OmniContact's reference
-generator and DemoHLM's three segments (walk, reach in the object's frame, lift in the robot's frame).
+baseline. It sees the true state, including contact forces.
 """
 
 from __future__ import annotations
@@ -25,96 +24,12 @@ from lowlevel.rotations import (
     rotate_inverse,
     yaw_of,
 )
-from robots.g1.constants import ARM_JOINTS, WAIST_JOINTS
+from robots.g1.constants import ARM_JOINTS, PALM_HALF_THICKNESS, SOLE_CENTER, WAIST_JOINTS
 from tasks.lift_box.arms import ArmKinematics, palm_rotation
+from tasks.lift_box.expert_config import CLOSE, DESCEND, HOLD, LIFT, STOP, WALK, ExpertConfig
 from tasks.lift_box.geometry import Situation
 from tasks.lift_box.reward import PALM_BELOW_TOP, grasp_posture
 from tasks.lift_box.task import LiftBox
-
-WALK, STOP, DESCEND, CLOSE, LIFT, HOLD = range(6)
-PHASES = ("walk", "stop", "descend", "close", "lift", "hold")
-
-
-@dataclass(frozen=True)
-class ExpertConfig:
-    """How the expert moves."""
-
-    stand_off: float = 0.27
-    """Near face ahead of the feet when the walk ends [m]: clear of the knees of a deep squat."""
-    gate_distance: float = 0.70
-    """Near face ahead of the feet at the gate in front of the box, where it lines up [m]."""
-    gate_lateral: float = 0.15
-    """Lateral error beyond which it goes to the gate before it goes to the box [m]."""
-    position_gain: float = 1.2
-    """[1/s]"""
-    yaw_gain: float = 1.6
-    """[1/s]"""
-    slowest: float = 0.14
-    """Least speed while walking [m/s]: the controller ignores slower commands."""
-    position_tolerance: float = 0.04
-    """Along the box's x axis [m]."""
-    lateral_tolerance: float = 0.07
-    """Along its y axis, where the arms make up for the rest [m]."""
-    yaw_tolerance: float = 0.09
-    """[rad]"""
-    loose: float = 1.5
-    """Tolerances grow by this factor once it stands, before it walks again."""
-    settle_time: float = 0.5
-    """Standing time before the descent [s]."""
-    descend_time: float = 2.0
-    """[s]"""
-    clearance: float = 0.07
-    """Of each palm from its face before the grasp [m]."""
-    palm_ahead: float = 0.0
-    """Of the palms from the middle of the side faces [m]."""
-    finger_pitch: float = 0.85
-    """Fingers point down by this much [rad]."""
-    toe_in: float = 0.12
-    """Fingers point at each other by this much, so that forearms stay clear of the faces [rad]."""
-    toe_in_per_depth: float = 2.5
-    """More of it per squeeze depth [rad/m]: the wrists give way, and the palms must not open."""
-    level_gain: float = 0.05
-    """Share of the box's pitch that the fingers take back at every decision while it is carried."""
-    largest_level: float = 0.6
-    """[rad]"""
-    wide: float = 0.06
-    """Extra clearance of each palm while the body descends [m]."""
-    reach_length: float = 0.42
-    """Largest distance of a palm from its shoulder while the body descends [m]."""
-    ready_tolerance: float = 0.06
-    """Of the palms from their pre-grasp places before they close [m]."""
-    close_speed: float = 0.16
-    """Of each palm towards its face [m/s]."""
-    force: float = 36.0
-    """Wanted normal force per palm [N]."""
-    force_gain: float = 0.0016
-    """Squeeze depth per force error and decision [m/N]."""
-    deepest: float = 0.095
-    """Largest squeeze depth [m]."""
-    grasp_time: float = 0.3
-    """Time with both palms loaded before the lift [s]."""
-    lift_time: float = 2.2
-    """[s]"""
-    carry_ahead: float = 0.34
-    """Of the palms from the feet when upright [m]."""
-    carry_height: float = 0.74
-    """Least height of the palms when upright [m]."""
-    carry_clearance: float = 0.38
-    """Least bottom of the box above its support when upright [m]."""
-    raise_gain: float = 0.08
-    """Share of the missing clearance that the palms rise by at every decision once upright; the arms give way."""
-    largest_raise: float = 0.2
-    """[m]"""
-    stand_height: float = 0.75
-    """[m]"""
-    pitch_filter: float = 0.2
-    """Share of the torso's pitch error that the arms take in at every decision during the lift."""
-    hold_filter: float = 0.05
-    """The same while the box is held."""
-    correction_gain: float = 0.25
-    """Share of the palms' position error that is added to the correction at every decision."""
-    largest_correction: float = 0.08
-    """[m]"""
 
 
 @dataclass
@@ -180,7 +95,7 @@ class LiftBoxExpert:
 
     @property
     def phase(self) -> Tensor:
-        """Current phase of each robot (N,), an index into :data:`PHASES`."""
+        """Current phase of each robot (N,), from ``WALK`` to ``HOLD``."""
         return self._memory.phase
 
     def reset(self, ids: Tensor) -> None:
@@ -266,9 +181,8 @@ class LiftBoxExpert:
 
     def _near_face_from_feet(self, measured: Measurement, situation: Situation) -> Tensor:
         robot = measured.robot
-        # The foot sites lie 3.5 cm ahead of the ankles.
         feet = robot.foot_position.mean(dim=1) - robot.base_position
-        feet = rotate_about_vertical(-measured.heading, feet)[:, :2] - torch.tensor([0.035, 0.0])
+        feet = rotate_about_vertical(-measured.heading, feet)[:, :2] - torch.tensor([SOLE_CENTER, 0.0])
         return situation.near_face[:, :2] - feet
 
     def _velocity(self, measured: Measurement, situation: Situation) -> Tensor:
@@ -321,7 +235,7 @@ class LiftBoxExpert:
         at_box = box[:, :3] + config.palm_ahead * forward
         at_box[:, 2] = episode.support_height + episode.size[:, 2] - PALM_BELOW_TOP
         feet = robot.foot_position.mean(dim=1)
-        carry = feet + (config.carry_ahead - 0.035) * forward
+        carry = feet + (config.carry_ahead - SOLE_CENTER) * forward
         carry_height = episode.support_height + config.carry_clearance + episode.size[:, 2] - PALM_BELOW_TOP
         carry[:, 2] = carry_height.clamp_min(config.carry_height) + self._raise_box(situation)
         # Up first, then back: the box must clear the knees.
@@ -334,8 +248,8 @@ class LiftBoxExpert:
         wide = config.wide * _smooth((4.0 * (1.0 - memory.descent)).clamp(0.0, 1.0)) * ~lifting
         apart = 0.5 * episode.size[:, 1] - memory.depth + wide
         side = torch.tensor([1.0, -1.0])
-        # The kinematic palm centre lies inside the hand, 1.2 cm behind the surface that touches.
-        offset = side[None, :, None] * (apart + 0.012)[:, None, None] * left[:, None]
+        # The kinematic palm centre lies inside the hand, behind the surface that touches.
+        offset = side[None, :, None] * (apart + PALM_HALF_THICKNESS)[:, None, None] * left[:, None]
         target = middle[:, None] + offset
         target = self._within_reach(target, measured)
         error = middle[:, None] + side[None, :, None] * apart[:, None, None] * left[:, None] - robot.palm_position
