@@ -261,7 +261,9 @@ def report_text(evaluation: Evaluation) -> str:
             f"(Wilson intervals for shares). Steady figures leave out the first {TRANSIENT:.0f} s after a "
             "change of command. A fallen episode counts in full at the error it had until its fall.",
             "",
-            markdown_table(["figure", "unit", "ours", "ours, steady", "paper"], _main_rows(figures, evaluation.suite)),
+            markdown_table(
+                ["figure", "unit", "ours", "ours, steady", "paper, blind"], _main_rows(figures, evaluation.suite)
+            ),
             "![tracking](tracking.png)",
             "",
             f"Travelling costs {format_figure(energy, 0)} J per metre: the sum of |torque times joint speed| over all "

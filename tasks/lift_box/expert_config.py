@@ -21,7 +21,7 @@ class ExpertConfig:
     """Near face ahead of the feet at the gate in front of the box, where it lines up [m]."""
     gate_lateral: float = 0.15
     """Lateral error beyond which it goes to the gate before it goes to the box [m]."""
-    position_gain: float = 0.5
+    position_gain: float = 1.2
     """[1/s]"""
     yaw_gain: float = 1.6
     """[1/s]"""
