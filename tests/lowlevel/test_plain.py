@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from pathlib import Path
 
 import pytest
 
 from lowlevel.plain import from_plain
+from lowlevel.provenance import read_training_config
 from lowlevel.trainer import TrainingConfig
 
 
@@ -28,3 +30,8 @@ def test_unknown_and_absent_fields_are_refused(change, message: str) -> None:
     plain["environment"]["nominal"] = change(plain["environment"]["nominal"])
     with pytest.raises(KeyError, match=message):
         from_plain(TrainingConfig, plain)
+
+
+def test_the_shipped_learning_state_is_of_this_version() -> None:
+    run = Path(__file__).resolve().parents[2] / "checkpoints" / "training" / "pilot-g1-simple"
+    assert read_training_config(run).environment.terrain.tiles == ("flat", "irregular")
