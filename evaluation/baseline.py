@@ -8,7 +8,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS
+from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS, gain_set
 from robots.g1.model import ModelOptions, build_spec
 
 
@@ -24,7 +24,7 @@ class PlainMujocoEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's interface)
 
     def __init__(self, gains: str, timestep: float, decimation: int) -> None:
-        self._model = build_spec(ModelOptions(gains=gains, timestep=timestep)).compile()
+        self._model = build_spec(ModelOptions(gains=gain_set(gains), timestep=timestep)).compile()
         self._data = mujoco.MjData(self._model)
         self._decimation = decimation
         size = self._model.nq + self._model.nv

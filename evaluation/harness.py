@@ -23,7 +23,7 @@ from lowlevel.randomization import RandomizationConfig, Randomizer
 from lowlevel.rotations import from_roll_pitch_yaw
 from lowlevel.simulation import BatchSimulation
 from lowlevel.terrain import MAP_SIZE, Terrain, TerrainConfig
-from robots.g1.constants import DEFAULT_POSITION, GAINS, LOWER_JOINTS, NUM_JOINTS, joint_index
+from robots.g1.constants import DEFAULT_POSITION, LOWER_JOINTS, NUM_JOINTS, joint_index
 from robots.g1.model import ModelOptions, build_spec
 
 BATCH = 32
@@ -140,7 +140,7 @@ class Arena:
         batch: robots simulated side by side (N).
 
     Raises:
-        ValueError: if the controller's gains are none of the simulated robot's, or it runs at another rate.
+        ValueError: if the controller runs at another rate.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class Arena:
         self.controller = controller
         self.batch = batch
         self.terrain = Terrain(terrain)
-        spec = build_spec(ModelOptions(gains=gain_set(controller), timestep=TIMESTEP))
+        spec = build_spec(ModelOptions(gains=controller.gains, timestep=TIMESTEP))
         self.terrain.add_to(spec)
         self.simulation = BatchSimulation(spec.compile(), batch, DECIMATION, num_threads)
         self.period = self.simulation.control_period
@@ -337,19 +337,6 @@ def batch_steps(arena: Arena, episodes: Sequence[Episode]) -> int:
     size = arena.batch
     batches = [episodes[first : first + size] for first in range(0, len(episodes), size)]
     return sum(max(round(episode.duration / arena.period) for episode in batch) for batch in batches)
-
-
-def gain_set(controller: Controller) -> str:
-    """Name of the gain set that the controller was trained with.
-
-    Raises:
-        ValueError: if it is none of :data:`robots.g1.constants.GAINS`.
-    """
-    for name, gains in GAINS.items():
-        parts = ("stiffness", "damping")
-        if all(np.allclose(getattr(gains, part), getattr(controller.gains, part)) for part in parts):
-            return name
-    raise ValueError(f"the controller's gains are none of the sets that can be simulated: {', '.join(GAINS)}")
 
 
 def _symmetric(generator: torch.Generator, *shape: int) -> Tensor:

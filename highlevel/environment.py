@@ -24,7 +24,6 @@ from lowlevel.simulation import BatchSimulation
 from lowlevel.terrain import Terrain, TerrainConfig
 from robots.g1.constants import (
     DEFAULT_POSITION,
-    JOINT_NAMES,
     LOWER_JOINTS,
     NUM_JOINTS,
     PELVIS_BODY,
@@ -141,11 +140,12 @@ class CommandEnvironment:
     def _build_simulation(self, num_envs: int) -> BatchSimulation:
         config, physics = self.controller.config, self.physics
         options = ModelOptions(
-            timestep=physics.timestep, elliptic_friction=True, solver_iterations=physics.solver_iterations
+            gains=self.controller.gains,
+            timestep=physics.timestep,
+            elliptic_friction=True,
+            solver_iterations=physics.solver_iterations,
         )
         spec = build_spec(options)
-        for name, stiffness, damping in zip(JOINT_NAMES, config.stiffness, config.damping, strict=True):
-            spec.actuator(name).set_to_position(kp=stiffness, kv=damping)
         self.terrain.add_to(spec)
         self.task.add_to(spec)
         decimation = round(config.control_period / physics.timestep)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lowlevel.nominal import NominalState
 from lowlevel.observation import FRAME_SIZE, HISTORY_LENGTH
 from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import NUM_JOINTS
@@ -24,12 +25,7 @@ class Buffers:
     action: Tensor
     previous_action: Tensor
     previous_target: Tensor
-    reference: Tensor
-    phase: Tensor
-    walking: Tensor
-    stepping: Tensor
-    settling: Tensor
-    unbalance: Tensor
+    nominal: NominalState
     history: Tensor
     elevation: Tensor
     foot_air_time: Tensor
@@ -53,12 +49,7 @@ class Buffers:
             action=zeros(NUM_JOINTS),
             previous_action=zeros(NUM_JOINTS),
             previous_target=zeros(NUM_JOINTS),
-            reference=neutral.clone(),
-            phase=zeros(),
-            walking=zeros(),
-            stepping=zeros(),
-            settling=zeros(),
-            unbalance=zeros(),
+            nominal=NominalState.standing(neutral.clone()),
             history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
             elevation=zeros(MAP_SIZE),
             foot_air_time=zeros(2),

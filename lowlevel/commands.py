@@ -73,6 +73,10 @@ class CommandMixture:
     """Share of commands that stand still with the full posture range and moving arms (I = 1)."""
     stand: float = 0.0
     """Share of commands that stand still in the neutral posture (I = 0); what is left walks in it (I = 0)."""
+    slow: float = 0.0
+    """Share of the walking commands whose velocity is scaled down by ``slow_scale``: a planner walks slowly."""
+    slow_scale: float = 0.35
+    """Factor on the velocity of slow commands."""
     walking_min_height: float = 0.55
     """Lowest base height while walking [m]."""
     walking_max_roll: float = 0.2
@@ -120,6 +124,8 @@ class CommandSampler:
         command = self.neutral.repeat(count, 1)
 
         velocity = self.lower[VELOCITY] + uniform(count, 3) * (self.upper[VELOCITY] - self.lower[VELOCITY])
+        if mixture.slow > 0.0:
+            velocity = torch.where(uniform(count, 1) < mixture.slow, mixture.slow_scale * velocity, velocity)
         command[:, VELOCITY] = open_range.velocity * velocity * walks[:, None]
 
         lowest = torch.where(walks, mixture.walking_min_height, self.lower[HEIGHT].item())

@@ -5,6 +5,7 @@ Whatever a controller remembers between steps goes in and comes out; nothing els
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -28,18 +29,8 @@ from robots.g1.constants import NUM_JOINTS
 class Memory(NamedTuple):
     """What a controller carries from one control step to the next, one row per robot."""
 
-    reference: Tensor
-    """Slewed command (N, 21)."""
-    phase: Tensor
-    """Gait phase (N,) [rad]."""
-    walking: Tensor
-    """Fade-in of the march (N,) in [0, 1]."""
-    stepping: Tensor
-    """Time for which a robot told to stand still marches to catch itself (N,) [s]."""
-    settling: Tensor
-    """Time for which a robot told to stand still keeps its posture (N,) [s]."""
-    unbalance: Tensor
-    """As :meth:`NominalMotion.joint_targets` found it last (N,) [rad]."""
+    nominal: NominalState
+    """References, gait clock and feedback."""
     action: Tensor
     """Last action (N, 29), in action scales."""
     history: Tensor
@@ -50,21 +41,27 @@ class Memory(NamedTuple):
     @classmethod
     def fresh(cls, num_robots: int, space: CommandSpace, device: torch.device | str = "cpu") -> Memory:
         """The memory of robots that have not acted yet."""
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(num_robots, *shape, device=device)
-
         return cls(
-            reference=space.neutral(device).repeat(num_robots, 1),
-            phase=zeros(),
-            walking=zeros(),
-            stepping=zeros(),
-            settling=zeros(),
-            unbalance=zeros(),
-            action=zeros(NUM_JOINTS),
-            history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
+            nominal=NominalState.standing(space.neutral(device).repeat(num_robots, 1)),
+            action=torch.zeros(num_robots, NUM_JOINTS, device=device),
+            history=torch.zeros(num_robots, HISTORY_LENGTH + 1, FRAME_SIZE, device=device),
             is_fresh=torch.ones(num_robots, dtype=torch.bool, device=device),
         )
+
+    @classmethod
+    def from_tensors(cls, tensors: Sequence[Tensor]) -> Memory:
+        """The memory whose :attr:`tensors` these are."""
+        count = len(NominalState._fields)
+        return cls(NominalState(*tensors[:count]), *tensors[count:])
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """One after the other, as :data:`MEMORY_NAMES` names them."""
+        return *self.nominal, *self[1:]
+
+
+MEMORY_NAMES = (*NominalState._fields, *Memory._fields[1:])
+"""Names of :attr:`Memory.tensors`."""
 
 
 class StepResult(NamedTuple):
@@ -96,9 +93,8 @@ class ControlStep(nn.Module):
         self, measured: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor, memory: Memory
     ) -> StepResult:
         """One control period, with ``elevation_map`` (N, 121) [m], ``command`` (N, 21) and ``flag`` (N, 1)."""
-        state = NominalState(memory.reference, memory.phase, memory.walking, memory.stepping, memory.settling)
         command = self.motion.clamp(command)
-        state = self.motion.advance(state, command, memory.unbalance)
+        state = self.motion.advance(memory.nominal, command)
         frame = self._build_frame(
             measured.joint_position,
             measured.joint_velocity,
@@ -112,18 +108,8 @@ class ControlStep(nn.Module):
         history = torch.where(started, start_history(frame), push_history(memory.history, frame))
         output = self.actor(history.flatten(1), map_observation(elevation_map), flag)
         action = output.mean.clamp(-self.action_limit, self.action_limit)
-        nominal, unbalance = self.motion.joint_targets(
-            state, measured.projected_gravity, measured.base_angular_velocity
+        nominal_target, state = self.motion.joint_targets(
+            state, measured.joint_position, measured.projected_gravity, measured.base_angular_velocity
         )
-        remembered = Memory(
-            state.reference,
-            state.phase,
-            state.walking,
-            state.stepping,
-            state.settling,
-            unbalance,
-            action,
-            history,
-            torch.zeros_like(memory.is_fresh),
-        )
-        return StepResult(nominal + action * self._action_scale, output.gate, remembered)
+        remembered = Memory(state, action, history, torch.zeros_like(memory.is_fresh))
+        return StepResult(nominal_target + action * self._action_scale, output.gate, remembered)

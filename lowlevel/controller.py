@@ -27,7 +27,8 @@ from lowlevel.files import atomic_write
 from lowlevel.frozen_folder import FrozenFolder
 from lowlevel.golden import GOLDEN_ROBOTS, golden_vectors
 from lowlevel.networks import NetworkConfig, ObservationSizes, PilotActor
-from lowlevel.nominal import NominalConfig, NominalMotion
+from lowlevel.nominal import NominalMotion
+from lowlevel.nominal_config import NominalConfig
 from lowlevel.observation import (
     FRAME,
     FRAME_SIZE,
@@ -40,7 +41,7 @@ from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
     "controller.json",
     "weights.safetensors",
@@ -128,7 +129,7 @@ class Controller:
         if self._memory is None or ids is None or len(self._memory.action) != num_robots:
             self._memory = fresh
             return
-        for remembered, cleared in zip(self._memory, fresh, strict=True):
+        for remembered, cleared in zip(self._memory.tensors, fresh.tensors, strict=True):
             remembered[ids] = cleared[ids]
 
     @torch.no_grad()
@@ -160,7 +161,7 @@ class Controller:
         """Slewed command (N, 21) that the nominal motion follows."""
         if self._memory is None:
             raise RuntimeError("call reset() first")
-        return self._memory.reference
+        return self._memory.nominal.reference
 
     def twin(self, num_robots: int) -> Controller:
         """A controller on the CPU with copies of the weights and a fresh memory for ``num_robots`` robots."""

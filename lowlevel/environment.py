@@ -20,7 +20,8 @@ from lowlevel.commands import (
     command_space,
 )
 from lowlevel.measures import Measurement, has_fallen, height_error, torso_error
-from lowlevel.nominal import NominalConfig, NominalMotion, NominalState
+from lowlevel.nominal import NominalMotion, NominalState
+from lowlevel.nominal_config import NominalConfig
 from lowlevel.observation import (
     PRIVILEGED_SIZE,
     FrameBuilder,
@@ -34,8 +35,8 @@ from lowlevel.rewards import RewardWeights, Transition, compute_rewards
 from lowlevel.rotations import about_axis, multiply
 from lowlevel.simulation import BatchSimulation
 from lowlevel.snapshot import Snapshot, take_snapshot, with_rows
-from lowlevel.terrain import Terrain, TerrainConfig
-from robots.g1.constants import ARM_JOINTS, GAINS, LOWER_JOINTS, NUM_JOINTS, WAIST_JOINTS
+from lowlevel.terrain import STANCE_REACH, Terrain, TerrainConfig
+from robots.g1.constants import ARM_JOINTS, LOWER_JOINTS, NUM_JOINTS, WAIST_JOINTS, gain_set
 from robots.g1.model import ModelOptions, build_spec
 
 MAP_REFRESH_STEPS = 5
@@ -66,9 +67,10 @@ class EnvironmentConfig:
     """Actions are clipped to +- this many action scales."""
     nominal: NominalConfig = field(default_factory=NominalConfig)
     mixture: CommandMixture = field(
-        default_factory=lambda: CommandMixture(walk_and_work=0.35, stand_and_work=0.4, stand=0.1)
+        default_factory=lambda: CommandMixture(walk_and_work=0.35, stand_and_work=0.4, stand=0.1, slow=0.25)
     )
-    """Unlike the evaluation it also stands in the neutral posture: what a planner starts from and stops in."""
+    """Unlike the evaluation it also stands in the neutral posture, what a planner starts from and stops in, and walks
+    slowly."""
     terrain: TerrainConfig = field(default_factory=TerrainConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
@@ -115,7 +117,8 @@ class PilotEnvironment:
         self.device = torch.device(device)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         self.terrain = Terrain(config.terrain, device)
-        spec = build_spec(ModelOptions(gains=config.gains, timestep=config.timestep))
+        gains = gain_set(config.gains)
+        spec = build_spec(ModelOptions(gains=gains, timestep=config.timestep))
         self.terrain.add_to(spec)
         self.simulation = BatchSimulation(
             spec.compile(), config.num_robots, config.decimation, config.num_threads, device
@@ -125,7 +128,6 @@ class PilotEnvironment:
         lower, upper = self.simulation.joint_lower, self.simulation.joint_upper
         self.command_space = command_space(lower.tolist(), upper.tolist())
         self.sampler = CommandSampler(self.command_space, config.mixture, device)
-        gains = GAINS[config.gains]
         self.motion = NominalMotion(config.nominal, gains, self.control_period, device)
         self.action_scale = torch.tensor(gains.action_scale, dtype=torch.float32, device=device)
         self.build_frame = FrameBuilder(self.command_space, self.motion, device)
@@ -161,8 +163,11 @@ class PilotEnvironment:
         buffers = self.buffers
         action = action.clamp(-self.config.action_limit, self.config.action_limit)
         frame = split_frame(buffers.history[:, -1])
-        nominal_target, buffers.unbalance = self.motion.joint_targets(
-            self._nominal_state(), frame["projected_gravity"], frame["base_angular_velocity"]
+        nominal_target, buffers.nominal = self.motion.joint_targets(
+            buffers.nominal,
+            frame["joint_position"] + self.motion.default,
+            frame["projected_gravity"],
+            frame["base_angular_velocity"],
         )
         target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
         applied = torch.where(self.randomizer.state.is_delayed, buffers.previous_target, target)
@@ -174,7 +179,7 @@ class PilotEnvironment:
         buffers.previous_action, buffers.action = buffers.action, action
         buffers.episode_step += 1
         self._update_foot_times(measured)
-        fallen = has_fallen(measured, buffers.reference) | self.simulation.diverged()
+        fallen = has_fallen(measured, buffers.nominal.reference) | self.simulation.diverged()
         truncated = (buffers.episode_step >= self.max_steps) & ~fallen
         transition = Transition(
             measured=measured,
@@ -183,8 +188,8 @@ class PilotEnvironment:
             action=action,
             previous_action=buffers.previous_action,
             nominal_target=nominal_target,
-            phase=buffers.phase,
-            walking=buffers.walking,
+            phase=buffers.nominal.phase,
+            walking=buffers.nominal.walking,
             foot_air_time=buffers.foot_air_time,
             foot_contact_time=buffers.foot_contact_time,
             fallen=fallen,
@@ -221,17 +226,10 @@ class PilotEnvironment:
 
     # -- parts of a step --------------------------------------------------------------------------------------
 
-    def _nominal_state(self) -> NominalState:
-        buffers = self.buffers
-        return NominalState(buffers.reference, buffers.phase, buffers.walking, buffers.stepping, buffers.settling)
-
     def _advance_nominal(self) -> None:
         buffers = self.buffers
-        before = self._nominal_state()
-        after = self.motion.advance(before, buffers.command, buffers.unbalance)
-        buffers.tracked_command = self.motion.tracked_command(after, buffers.command)
-        buffers.reference, buffers.phase, buffers.walking = after.reference, after.phase, after.walking
-        buffers.stepping, buffers.settling = after.stepping, after.settling
+        buffers.nominal = self.motion.advance(buffers.nominal, buffers.command)
+        buffers.tracked_command = self.motion.tracked_command(buffers.nominal, buffers.command)
 
     def _update_foot_times(self, measured: Measurement) -> None:
         contact, period = measured.foot_contact, self.control_period
@@ -257,8 +255,8 @@ class PilotEnvironment:
         neutral = self.sampler.neutral.expand(count, -1)
         reference = torch.where(in_posture, buffers.command[ids], neutral).clone()
         reference[:, VELOCITY] = 0.0
-        buffers.reference[ids], buffers.phase[ids], buffers.walking[ids] = reference, 0.0, 0.0
-        buffers.stepping[ids], buffers.settling[ids], buffers.unbalance[ids] = 0.0, 0.0, 0.0
+        for remembered, fresh in zip(buffers.nominal, NominalState.standing(reference), strict=True):
+            remembered[ids] = fresh
 
         heading = self._uniform(-torch.pi, torch.pi, count)
         facing = about_axis(2, heading)
@@ -277,11 +275,11 @@ class PilotEnvironment:
         tile = torch.randint(len(self.terrain.tile_centers), (count,), generator=self.generator, device=self.device)
         reach = 0.5 * self.config.terrain.tile_size - 1.0
         xy = self.terrain.tile_centers[tile] + self._uniform(-reach, reach, count, 2)
-        on_ground = torch.cat([xy, torch.zeros(count, 1, device=self.device)], -1)
-        highest_ground = -self.terrain.elevation_map(on_ground, heading).amin(dim=1)
-        base_position = torch.cat([xy, (highest_ground + height + 0.005)[:, None]], -1)
+        ground = self.terrain.highest(xy, STANCE_REACH)
+        base_position = torch.cat([xy, (ground + height + 0.005)[:, None]], -1)
         base_velocity = torch.zeros(count, 6, device=self.device)
-        base_velocity[:, :3] = self._uniform(-0.2, 0.2, count, 3)
+        fastest = self.config.randomization.start_velocity
+        base_velocity[:, :3] = self._uniform(-fastest, fastest, count, 3)
         self.simulation.reset(ids, base_position, orientation, joint_position, base_velocity)
         self.randomizer.draw(ids, self.open_range.arms)
         self.simulation.forward(ids)
@@ -302,7 +300,7 @@ class PilotEnvironment:
             measured.projected_gravity,
             buffers.tracked_command,
             buffers.action,
-            self._nominal_state(),
+            buffers.nominal,
         )
 
     def _observe(self, now: Snapshot, new_episodes: Tensor) -> dict[str, Tensor]:
@@ -352,7 +350,8 @@ class PilotEnvironment:
         """Everything needed to continue bit-exactly on a CPU."""
         return {
             "simulation": self.simulation.state_dict(),
-            "buffers": {f.name: getattr(self.buffers, f.name) for f in fields(Buffers)},
+            "buffers": {f.name: getattr(self.buffers, f.name) for f in fields(Buffers) if f.name != "nominal"},
+            "nominal": self.buffers.nominal._asdict(),
             "randomization": {f.name: getattr(self.randomizer.state, f.name) for f in fields(self.randomizer.state)},
             "generator": self.generator.get_state(),
             "step_count": self._step_count,
@@ -363,6 +362,7 @@ class PilotEnvironment:
         self.simulation.load_state_dict(state["simulation"])
         for name, value in state["buffers"].items():
             setattr(self.buffers, name, value.clone())
+        self.buffers.nominal = NominalState(**{name: value.clone() for name, value in state["nominal"].items()})
         for name, value in state["randomization"].items():
             setattr(self.randomizer.state, name, value.clone())
         self.generator.set_state(state["generator"])

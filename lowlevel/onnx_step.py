@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from lowlevel.commands import CommandSpace
-from lowlevel.control_step import ControlStep, Memory, StepResult
+from lowlevel.control_step import MEMORY_NAMES, ControlStep, Memory, StepResult
 from lowlevel.files import atomic_write
 from lowlevel.observation import Proprioception
 from lowlevel.terrain import MAP_SIZE
@@ -27,10 +27,10 @@ INPUTS = (
     "elevation_map",
     "command",
     "flag",
-    *Memory._fields,
+    *MEMORY_NAMES,
 )
 """Of the file; shapes and units are those of :meth:`lowlevel.controller.Controller.act` and :class:`Memory`."""
-OUTPUTS = ("targets", "gate", *(f"next_{name}" for name in Memory._fields))
+OUTPUTS = ("targets", "gate", *(f"next_{name}" for name in MEMORY_NAMES))
 
 
 class _Flat(nn.Module):
@@ -41,15 +41,15 @@ class _Flat(nn.Module):
         self.step = step
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        result = self.step(Proprioception(*tensors[:4]), *tensors[4:7], Memory(*tensors[7:]))
-        return result.targets, result.gate, *result.memory
+        result = self.step(Proprioception(*tensors[:4]), *tensors[4:7], Memory.from_tensors(tensors[7:]))
+        return result.targets, result.gate, *result.memory.tensors
 
 
 def export_step(step: ControlStep, space: CommandSpace, path: Path) -> None:
     """Write :data:`INPUTS` to :data:`OUTPUTS` as an ONNX file, for any number of robots."""
     count = 2
     measured = [torch.zeros(count, size) for size in (NUM_JOINTS, NUM_JOINTS, 3, 3, MAP_SIZE)]
-    inputs = (*measured, space.neutral().repeat(count, 1), torch.ones(count, 1), *Memory.fresh(count, space))
+    inputs = (*measured, space.neutral().repeat(count, 1), torch.ones(count, 1), *Memory.fresh(count, space).tensors)
     rows = torch.export.Dim("robots")
     program = torch.onnx.export(
         _Flat(step),
@@ -83,7 +83,7 @@ class OnnxStep:
             measured.base_angular_velocity,
             measured.projected_gravity,
         )
-        values = zip(INPUTS, (*proprioception, elevation_map, command, flag, *memory), strict=True)
+        values = zip(INPUTS, (*proprioception, elevation_map, command, flag, *memory.tensors), strict=True)
         outputs = self._session.run(OUTPUTS, {name: value.numpy() for name, value in values})
         targets, gate, *remembered = (torch.from_numpy(output) for output in outputs)
-        return StepResult(targets, gate, Memory(*remembered))
+        return StepResult(targets, gate, Memory.from_tensors(remembered))

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 from lowlevel.environment import EnvironmentConfig
 from lowlevel.networks import NetworkConfig
-from lowlevel.nominal import NominalConfig
+from lowlevel.nominal_config import NominalConfig
+from lowlevel.rewards import PAPER_WEIGHTS
 from lowlevel.terrain import TerrainConfig
 from lowlevel.trainer import TrainingConfig
 
@@ -35,6 +36,7 @@ PRESETS: dict[str, TrainingConfig] = {
             rewards=replace(FLAT.environment.rewards, foot_phase=0.0),
         ),
     ),
+    "paper-weights": replace(FLAT, environment=_environment(rewards=PAPER_WEIGHTS)),
     "soft-gains": replace(FLAT, environment=_environment(gains="soft")),
     "no-mirror": replace(FLAT, ppo=replace(FLAT.ppo, symmetry="none")),
 }

@@ -37,6 +37,8 @@ class RandomizationConfig:
     """Downward force on each hand [N]."""
     hand_squeeze: tuple[float, float] = (-30.0, 10.0)
     """Force on each hand towards the other one [N]; negative pushes outwards, as a squeezed box does."""
+    start_velocity: float = 0.2
+    """Largest velocity of the base at the start of an episode, per axis [m/s]."""
     push_velocity: float = 0.3
     """Largest horizontal velocity change of a push, per axis [m/s]."""
     push_interval: tuple[float, float] = (4.0, 8.0)
@@ -53,6 +55,7 @@ class RandomizationConfig:
             joint_offset=0.0,
             delay_probability=0.0,
             hand_load_probability=0.0,
+            start_velocity=0.0,
             push_velocity=0.0,
         )
 

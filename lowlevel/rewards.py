@@ -18,13 +18,13 @@ from robots.g1.constants import joint_index
 class RewardWeights:
     """Weight per second of each term; names are those of :data:`REWARD_TERMS`."""
 
-    # Table I, task rewards
-    linear_velocity: float = 1.5
-    angular_velocity: float = 2.0
-    base_height: float = 1.0
-    torso_orientation: float = 1.0
-    upper_body_position: float = 1.0
-    termination: float = -200.0
+    # Table I, task rewards; the paper's own weights are PAPER_WEIGHTS
+    linear_velocity: float = 3.0
+    angular_velocity: float = 3.0
+    base_height: float = 3.0
+    torso_orientation: float = 3.0
+    upper_body_position: float = 2.0
+    termination: float = -50.0
     # Table I, regularisation
     action_rate: float = -0.01
     energy: float = -0.001
@@ -41,6 +41,18 @@ class RewardWeights:
     """Tumbling motion of the pelvis."""
     velocity_progress: float = 1.0
     """Share of the commanded horizontal velocity that is reached, up to all of it."""
+
+
+PAPER_WEIGHTS = RewardWeights(
+    linear_velocity=1.5,
+    angular_velocity=2.0,
+    base_height=1.0,
+    torso_orientation=1.0,
+    upper_body_position=1.0,
+    termination=-200.0,
+)
+"""The paper's weights where the defaults are others: tracking counts for more, and a fall, which also ends all reward
+to come, for less."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ MAP_CELLS = 11
 MAP_RESOLUTION = 0.1
 """Cell size of the elevation map [m]."""
 MAP_SIZE = MAP_CELLS * MAP_CELLS
+STANCE_REACH = 0.3
+"""No part of a standing robot's soles is farther than this from the base, horizontally and along each axis [m]."""
 
 _cells = np.arange(MAP_SIZE).reshape(MAP_CELLS, MAP_CELLS)
 MAP_MIRROR = Mirror(_cells[:, ::-1].reshape(-1), np.ones(MAP_SIZE))
@@ -133,6 +135,13 @@ class Terrain:
         cells = torch.floor((points - self._origin) / self.config.raster_resolution).long()
         rows, columns = self._raster.shape
         return self._raster[cells[..., 0].clamp(-1, rows - 1), cells[..., 1].clamp(-1, columns - 1)]
+
+    def highest(self, center: Tensor, reach: float) -> Tensor:
+        """Highest ground [m] (N,) within ``reach`` [m] of ``center`` (N, 2) along both axes."""
+        count = 2 * round(reach / self.config.raster_resolution) + 1
+        offsets = torch.linspace(-reach, reach, count, device=center.device)
+        grid = torch.cartesian_prod(offsets, offsets)
+        return self.height(center[:, None] + grid).amax(dim=1)
 
     def elevation_map(self, base_position: Tensor, heading: Tensor) -> Tensor:
         """Vertical distance base - terrain [m] (N, 121) on the egocentric grid, aligned with the heading.

@@ -10,7 +10,7 @@ import torch
 from lowlevel.commands import command_space
 from lowlevel.controller import Controller, ControllerConfig, actor_sizes
 from lowlevel.networks import NetworkConfig, PilotActor
-from lowlevel.nominal import NominalConfig
+from lowlevel.nominal_config import NominalConfig
 from lowlevel.observation import FRAME, normalised_columns
 from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
 from robots.g1.model import build_spec, joint_limits

@@ -1,4 +1,4 @@
-"""Where the arms' mass is: its first moment for any arm posture, batched.
+"""Where the arms' mass is, and what it takes to hold it up, for any arm posture, batched.
 
 A G1's arms weigh 7 kg of 33: reaching out moves the centre of mass by centimetres, which the feet must follow.
 """
@@ -18,7 +18,7 @@ _ARM_LENGTH = 7
 
 
 class ArmMass:
-    """First moment of both arms' mass about the torso frame's origin.
+    """First moment of both arms' mass about the torso frame's origin, and static torques of their joints.
 
     Links are summed from the hand inwards: a link's subtree has its moment in its own frame, which the joint's
     rotation and offset carry into the frame of the link before it. That step is affine in the moment of the links
@@ -43,12 +43,42 @@ class ArmMass:
         # Robots come last in all that follows: the small products then run along memory.
         self._basis = torch.tensor(step.transpose(0, 2, 3, 4, 1)[..., None], dtype=torch.float32, device=device)
         """Constant, sine and cosine parts (3, 7, 3, 4, 2, 1) of each joint's step, rotation | translation."""
+        lever = (outboard[..., None] * offsets).transpose(1, 2, 0)[..., None]
+        self._lever = torch.tensor(lever, dtype=torch.float32, device=device)
+        """Mass of the links from a joint outwards times the joint's offset (7, 3, 2, 1) [kg m]."""
+        axis = (rotations @ np.eye(3)[axes][..., None])[..., 0].transpose(1, 2, 0)[..., None]
+        self._axis = torch.tensor(axis, dtype=torch.float32, device=device)
+        """Joint axes (7, 3, 2, 1) in the frame of the link before."""
+
+    def _steps(self, arms: Tensor) -> tuple[Tensor, ...]:
+        """Steps (3, 4, 2, N) of the joints from the shoulder outwards."""
+        angles = arms.T.unflatten(0, (2, 1, 1, _ARM_LENGTH)).transpose(0, 3).contiguous()
+        return blend(self._basis, angles).unbind()
 
     def first_moment(self, arms: Tensor) -> Tensor:
         """Sum of mass times position (N, 3) [kg m] in the torso frame, for 14 arm joints ``arms`` (N, 14) [rad]."""
-        angles = arms.T.unflatten(0, (2, 1, 1, _ARM_LENGTH)).transpose(0, 3).contiguous()
-        steps = blend(self._basis, angles).unbind()
-        moment = steps[-1][:, 3]
-        for step in steps[-2::-1]:
-            moment = (step[:, :3] * moment).sum(1) + step[:, 3]
-        return moment.sum(dim=1).T
+        return _carried_inwards(self._steps(arms))[0].sum(dim=1).T
+
+    def first_moment_and_torque(self, arms: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
+        """The first moment, and the joint torques (N, 14) [N m] that hold the arms up.
+
+        ``gravity`` (N, 3) [m/s^2]: in the torso frame.
+        """
+        steps = self._steps(arms)
+        moments = _carried_inwards(steps)
+        pull = gravity.T[:, None].expand(-1, 2, -1)
+        pulls = [pull]
+        for step in steps[:-1]:
+            pull = (step[:, :3] * pull[:, None]).sum(0)
+            pulls.append(pull)
+        about_joints = torch.stack(moments) - self._lever
+        torque = -(self._axis * torch.linalg.cross(about_joints, torch.stack(pulls), dim=1)).sum(1)
+        return moments[0].sum(dim=1).T, torque.transpose(0, 1).flatten(0, 1).T
+
+
+def _carried_inwards(steps: tuple[Tensor, ...]) -> list[Tensor]:
+    """First moment (3, 2, N) of the links from each joint outwards, in the frame of the link before it."""
+    moments = [steps[-1][:, 3]]
+    for step in steps[-2::-1]:
+        moments.append((step[:, :3] * moments[-1]).sum(1) + step[:, 3])
+    return moments[::-1]

@@ -4,8 +4,9 @@ Joint order is Unitree's and is stated once, in :data:`JOINTS`; everything else 
 Position limits and effort limits are read from the URDF by :mod:`robots.g1.model`.
 
 Sources: rotor inertias and the armature gain rule are those published with mjlab
-(``asset_zoo/robots/unitree_g1/g1_constants.py``) and BeyondMimic; leg and waist gains of the stiff set
-follow HOMIE's training configuration, arm gains follow Unitree's ``xr_teleoperate``.
+(``asset_zoo/robots/unitree_g1/g1_constants.py``) and BeyondMimic; waist and ankle gains of the stiff set
+follow HOMIE's training configuration, arm gains follow Unitree's ``xr_teleoperate``. Its hips and knees are stiffer
+than HOMIE's (100 and 150 N m/rad): standing on the ankles' 80 N m/rad alone leaves no room for legs that give way.
 """
 
 from __future__ import annotations
@@ -138,12 +139,23 @@ def _armature_gains() -> Gains:
 
 
 STIFF_GAINS = Gains(
-    stiffness=_per_joint((100, 100, 100, 150, 40, 40), (200, 200, 200), (80, 80, 80, 80, 40, 40, 40)),
-    damping=_per_joint((2.5, 2.5, 2.5, 4, 2, 2), (5, 5, 5), (3, 3, 3, 3, 1.5, 1.5, 1.5)),
-    action_scale=_per_joint((0.25,) * 6, (0.25,) * 3, (0.15,) * 7),
+    stiffness=_per_joint((150, 150, 150, 300, 40, 40), (200, 200, 200), (80, 80, 80, 80, 40, 40, 40)),
+    damping=_per_joint((5, 5, 5, 8, 2, 2), (5, 5, 5), (3, 3, 3, 3, 1.5, 1.5, 1.5)),
+    action_scale=_per_joint((1 / 6, 1 / 6, 1 / 6, 0.125, 0.25, 0.25), (0.25,) * 3, (0.15,) * 7),
 )
 SOFT_GAINS = _armature_gains()
 GAINS: dict[str, Gains] = {"stiff": STIFF_GAINS, "soft": SOFT_GAINS}
+
+
+def gain_set(name: str) -> Gains:
+    """A gain set of :data:`GAINS` by name.
+
+    Raises:
+        ValueError: if there is none of that name.
+    """
+    if name not in GAINS:
+        raise ValueError(f"unknown gain set {name!r}; choose one of {', '.join(GAINS)}")
+    return GAINS[name]
 
 
 def urdf_path() -> Path:

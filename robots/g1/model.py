@@ -16,7 +16,6 @@ import numpy as np
 from robots.g1.constants import (
     ARMATURE,
     FOOT_BODIES,
-    GAINS,
     HAND_BODIES,
     JOINT_NAMES,
     PALM_HALF_THICKNESS,
@@ -25,7 +24,9 @@ from robots.g1.constants import (
     SIDES,
     SOLE_CENTER,
     SOLE_OFFSET,
+    STIFF_GAINS,
     TORSO_BODY,
+    Gains,
     urdf_path,
 )
 
@@ -45,8 +46,8 @@ _FOOT_SPHERE_HEIGHT = SOLE_OFFSET + _FOOT_SPHERE_RADIUS
 class ModelOptions:
     """What the compiled model contains."""
 
-    gains: str = "stiff"
-    """Gain set of the position actuators, a key of :data:`robots.g1.constants.GAINS`."""
+    gains: Gains = STIFF_GAINS
+    """Stiffness and damping of the position actuators."""
     timestep: float = 0.002
     """Physics step [s]."""
     visuals: bool = False
@@ -65,11 +66,8 @@ def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:
     """The robot as an editable MuJoCo specification; ``.compile()`` gives nq 36, nv 35, nu 29.
 
     Raises:
-        ValueError: if the gain set is unknown.
         FileNotFoundError: if the URDF is not installed.
     """
-    if options.gains not in GAINS:
-        raise ValueError(f"unknown gain set {options.gains!r}; choose one of {', '.join(GAINS)}")
     spec = mujoco.MjSpec.from_string(_urdf_with_floating_base(options.visuals))
     _set_physics(spec, options)
     for geom in spec.geoms:  # what the URDF brings is visual only
@@ -121,7 +119,7 @@ def _set_physics(spec: mujoco.MjSpec, options: ModelOptions) -> None:
 
 
 def _add_actuators(spec: mujoco.MjSpec, options: ModelOptions) -> None:
-    gains = GAINS[options.gains]
+    gains = options.gains
     for index, name in enumerate(JOINT_NAMES):
         joint = spec.joint(name)
         joint.armature = ARMATURE[index]

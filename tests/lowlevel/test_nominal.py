@@ -17,7 +17,8 @@ from lowlevel.commands import (
     CommandSpace,
     command_space,
 )
-from lowlevel.nominal import NominalConfig, NominalMotion, NominalState
+from lowlevel.nominal import NominalMotion, NominalState
+from lowlevel.nominal_config import NominalConfig
 from robots.g1.constants import (
     ARM_JOINTS,
     DEFAULT_POSITION,
@@ -34,7 +35,7 @@ from robots.g1.model import build_spec, joint_limits
 LIMITS = joint_limits(build_spec().compile())
 UPRIGHT = torch.tensor([[0.0, 0.0, -1.0]])
 STILL = torch.zeros(1, 3)
-BALANCED = torch.zeros(1)
+DEFAULT = torch.tensor(DEFAULT_POSITION, dtype=torch.float32)[None]
 
 
 @pytest.fixture(scope="module")
@@ -52,48 +53,95 @@ def test_references_slew_at_their_rates_and_arrive(space: CommandSpace) -> None:
     start = space.neutral()[None]
     command = start.clone()
     command[:, HEIGHT], command[:, TORSO.start + 1], command[:, ARMS.start] = 0.5, 0.6, 1.1
-    state = nominal.initial_state(start)
-    state = nominal.advance(state, command, BALANCED)
+    state = NominalState.standing(start)
+    state = nominal.advance(state, command)
     change = state.reference - start
     assert change[0, HEIGHT].item() == pytest.approx(-0.25 * 0.02)
     assert change[0, TORSO.start + 1].item() == pytest.approx(1.0 * 0.02)
     assert change[0, ARMS.start].item() == pytest.approx(4.0 * 0.02)
     for _ in range(60):
-        state = nominal.advance(state, command, BALANCED)
+        state = nominal.advance(state, command)
     assert torch.allclose(state.reference, command)
 
 
 def test_clock_runs_while_walking_and_rests_while_standing(space: CommandSpace) -> None:
-    nominal = motion()
+    nominal = motion(stopping_time=0.0)
     stand, walk = space.neutral()[None], space.neutral()[None].clone()
     walk[:, VELOCITY.start] = 0.5
-    state = nominal.initial_state(stand)
+    state = NominalState.standing(stand)
     for _ in range(50):
-        state = nominal.advance(state, walk, BALANCED)
+        state = nominal.advance(state, walk)
     assert state.walking.item() == 1.0
     assert np.cos(state.phase.item()) == pytest.approx(1.0, abs=1e-5)  # two whole periods in one second
     assert nominal.clock(state).norm().item() == pytest.approx(1.0)
     for _ in range(19):  # slowing down from 0.5 m/s at 1 m/s^2
         assert state.walking.item() == 1.0
-        state = nominal.advance(state, stand, BALANCED)
+        state = nominal.advance(state, stand)
     for _ in range(20):
-        state = nominal.advance(state, stand, BALANCED)
+        state = nominal.advance(state, stand)
     assert state.phase.item() == 0.0 and not nominal.clock(state).any()
 
 
 def test_a_robot_that_tips_over_marches_for_a_while(space: CommandSpace) -> None:
     nominal = motion()
     stand = space.neutral()[None]
-    spinning = torch.tensor([[0.0, 2.0, 0.0]])
-    state = nominal.initial_state(stand)
-    unbalance = nominal.joint_targets(state, UPRIGHT, spinning)[1]
-    assert unbalance.item() == pytest.approx(2.0 * nominal.config.step_damping, abs=0.02)
-    state = nominal.advance(state, stand, unbalance)
+    spinning = torch.tensor([[0.0, 3.0, 0.0]])
+    state = nominal.joint_targets(NominalState.standing(stand), DEFAULT, UPRIGHT, spinning)[1]
+    assert state.unbalance.item() == pytest.approx(3.0 * nominal.config.step_damping, abs=0.02)
+    state = nominal.advance(state, stand)._replace(unbalance=torch.zeros(1))
     marched = 0
     while state.walking.item() > 0.0:
         marched += 1
-        state = nominal.advance(state, stand, BALANCED)
+        state = nominal.advance(state, stand)
     assert marched * 0.02 == pytest.approx(nominal.config.stepping_time + nominal.config.walking_ramp, abs=0.05)
+
+
+def test_a_lasting_tilt_is_no_unbalance(space: CommandSpace) -> None:
+    leaning = torch.tensor([[np.sin(0.2), 0.0, -np.cos(0.2)]], dtype=torch.float32)
+    for steady_time, lowest, highest in ((2.0, 0.0, 0.1), (0.0, 0.15, 0.25)):
+        nominal = motion(steady_time=steady_time)
+        state = NominalState.standing(space.neutral()[None])
+        first = nominal.joint_targets(state, DEFAULT, leaning, STILL)[1]
+        for _ in range(250):
+            state = nominal.joint_targets(state, DEFAULT, leaning, STILL)[1]
+        assert first.unbalance.item() > 0.15
+        assert lowest <= state.unbalance.item() < highest
+
+
+def test_the_waist_takes_up_a_lasting_torso_error(space: CommandSpace) -> None:
+    """The torso pitches 0.1 rad too far forwards and rolls 0.05 rad too far to the right."""
+    nominal = motion(balance_stiffness=1e-9, balance_damping=0.0, step_stiffness=0.0, torso_trim_rate=0.5)
+    state = NominalState.standing(space.neutral()[None])
+    tilted = pin.rpy.rpyToMatrix(0.05, 0.1, 0.0).T @ np.array([0.0, 0.0, -1.0])
+    gravity = torch.tensor(tilted, dtype=torch.float32)[None]
+    straight = DEFAULT.clone()
+    straight[:, WAIST_JOINTS] = 0.0
+    before = nominal.joint_targets(state, straight, UPRIGHT, STILL)[0]
+    for _ in range(50):
+        targets, state = nominal.joint_targets(state, straight, gravity, STILL)
+    moved = (targets - before)[0, WAIST_JOINTS]
+    assert moved.tolist() == pytest.approx([0.0, -0.05 * 0.5, -0.1 * 0.5], abs=2e-3)
+    for _ in range(500):
+        targets, state = nominal.joint_targets(state, straight, gravity, STILL)
+    assert state.torso_trim[0, 1].item() == pytest.approx(nominal.config.largest_torso_trim)
+
+
+def test_the_march_outlasts_a_stop(space: CommandSpace) -> None:
+    stand, walk = space.neutral()[None], space.neutral()[None].clone()
+    walk[:, VELOCITY.start] = 0.5
+
+    def time_to_rest(nominal: NominalMotion) -> float:
+        state = NominalState.standing(stand)
+        for _ in range(50):
+            state = nominal.advance(state, walk)
+        steps = 0
+        while state.walking.item() > 0.0:
+            state = nominal.advance(state, stand)
+            steps += 1
+        return steps * 0.02
+
+    longer = time_to_rest(motion(stopping_time=1.8)) - time_to_rest(motion(stopping_time=0.0))
+    assert longer == pytest.approx(0.8 * (0.5 - STANDING_SPEED), abs=0.05)
 
 
 def test_a_robot_told_to_stop_settles_before_it_changes_posture(space: CommandSpace) -> None:
@@ -104,7 +152,7 @@ def test_a_robot_told_to_stop_settles_before_it_changes_posture(space: CommandSp
 
     def steps_until_it_moves(state: NominalState) -> int:
         for step in range(200):
-            state = nominal.advance(state, squat, BALANCED)
+            state = nominal.advance(state, squat)
             tracked = nominal.tracked_command(state, squat)
             assert torch.equal(tracked[:, VELOCITY], state.reference[:, VELOCITY])
             if torch.equal(tracked, squat):
@@ -113,18 +161,18 @@ def test_a_robot_told_to_stop_settles_before_it_changes_posture(space: CommandSp
             assert torch.equal(tracked[:, ARMS], squat[:, ARMS])
         raise AssertionError("it never moves")
 
-    standing = nominal.initial_state(space.neutral()[None])
+    standing = NominalState.standing(space.neutral()[None])
     assert steps_until_it_moves(standing) == 0
     walking = standing
     for _ in range(50):
-        walking = nominal.advance(walking, walk, BALANCED)
+        walking = nominal.advance(walking, walk)
     assert torch.equal(nominal.tracked_command(walking, walk), walk)
-    slowing_down = (0.4 - STANDING_SPEED) / nominal.config.velocity_rate
+    slowing_down = (0.4 - STANDING_SPEED) * nominal.config.stopping_time
     expected = slowing_down + nominal.config.walking_ramp + nominal.config.settling_time
     # Each of the three ends within a control step, and steps count from zero.
     assert steps_until_it_moves(walking) * 0.02 == pytest.approx(expected, abs=4 * 0.02)
     at_once = motion(settling_time=0.0)
-    stopping = at_once.advance(at_once.advance(walking, walk, BALANCED), squat, BALANCED)
+    stopping = at_once.advance(at_once.advance(walking, walk), squat)
     tracked = at_once.tracked_command(stopping, squat)
     assert torch.equal(tracked[:, VELOCITY.stop :], squat[:, VELOCITY.stop :])
 
@@ -133,18 +181,19 @@ def test_a_robot_in_a_deep_squat_does_not_march(space: CommandSpace) -> None:
     nominal = motion()
     squat = space.neutral()[None].clone()
     squat[:, HEIGHT] = 0.4
-    assert nominal.advance(nominal.initial_state(squat), squat, torch.ones(1)).walking.item() == 0.0
+    falling = NominalState.standing(squat)._replace(unbalance=torch.ones(1))
+    assert nominal.advance(falling, squat).walking.item() == 0.0
 
 
 def test_arms_follow_the_reference_in_every_kind(space: CommandSpace) -> None:
     command = space.neutral()[None].clone()
     command[:, ARMS] += 0.1
     for kind in ("default", "pose", "march"):
-        nominal = motion(kind=kind)
-        targets = nominal.joint_targets(nominal.initial_state(command), UPRIGHT, STILL)[0]
+        nominal = motion(kind=kind, bear_arms=False)
+        targets = nominal.joint_targets(NominalState.standing(command), DEFAULT, UPRIGHT, STILL)[0]
         assert torch.allclose(targets[:, ARM_JOINTS], command[:, ARMS])
     default = motion(kind="default")
-    legs = default.joint_targets(default.initial_state(command), UPRIGHT, STILL)[0][0, :15]
+    legs = default.joint_targets(NominalState.standing(command), DEFAULT, UPRIGHT, STILL)[0][0, :15]
     assert torch.allclose(legs, torch.tensor(DEFAULT_POSITION[:15], dtype=torch.float32))
 
 
@@ -152,38 +201,38 @@ def test_march_half_a_period_later_is_the_mirror_image(space: CommandSpace) -> N
     nominal = motion()
     command = space.neutral()[None].clone()
     command[:, 0] = 0.8
-    state = nominal.initial_state(command)
+    state = NominalState.standing(command)
     state.walking[:] = 1.0
     for phase in (0.4, 1.3, 2.9):
         state.phase[:] = phase
-        now = nominal.joint_targets(state, UPRIGHT, STILL)[0]
+        now = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0]
         state.phase[:] = phase + np.pi
-        later = nominal.joint_targets(state, UPRIGHT, STILL)[0]
+        later = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0]
         assert np.allclose(JOINTS_MIRROR(now.numpy()), later.numpy(), atol=2e-3)
 
 
 def test_march_lifts_the_swing_leg_only(space: CommandSpace) -> None:
     nominal = motion()
-    state = nominal.initial_state(space.neutral()[None])
-    rest = nominal.joint_targets(state, UPRIGHT, STILL)[0]
+    state = NominalState.standing(space.neutral()[None])
+    rest = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0]
     state.walking[:], state.phase[:] = 1.0, np.pi / 2
-    lifted = nominal.joint_targets(state, UPRIGHT, STILL)[0] - rest
+    lifted = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0] - rest
     assert lifted[0, joint_index("left_knee_joint")].item() == pytest.approx(nominal.config.knee_lift, abs=1e-5)
     assert lifted[0, joint_index("right_knee_joint")].item() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_ankles_push_against_tilt_and_vanish_at_the_nominal_attitude(space: CommandSpace) -> None:
     nominal, without = motion(), motion(balance_stiffness=0.0)
-    state = nominal.initial_state(space.neutral()[None])
-    attitude = nominal.pelvis_attitude(
-        state.reference[:, TORSO], nominal.pose.lookup(state.reference[:, 3:7])[0][:, WAIST_JOINTS]
-    )
+    state = NominalState.standing(space.neutral()[None])
+    stance = DEFAULT.clone()
+    stance[:, LOWER_JOINTS] = nominal.pose.lookup(state.reference[:, POSTURE]).position
+    attitude = nominal.pelvis_attitude(state.reference[:, TORSO], stance[:, WAIST_JOINTS])
     rotation = pin.Quaternion(*attitude[0].double().tolist()).toRotationMatrix()
     nominal_gravity = torch.tensor(rotation.T @ np.array([0, 0, -1.0]), dtype=torch.float32)[None]
-    base = without.joint_targets(state, nominal_gravity, STILL)[0]
-    assert torch.allclose(nominal.joint_targets(state, nominal_gravity, STILL)[0], base, atol=1e-6)
+    base = without.joint_targets(state, stance, nominal_gravity, STILL)[0]
+    assert torch.allclose(nominal.joint_targets(state, stance, nominal_gravity, STILL)[0], base, atol=1e-6)
     forwards = torch.tensor([[np.sin(0.1), 0.0, -np.cos(0.1)]], dtype=torch.float32)
-    leaning = nominal.joint_targets(state, forwards, STILL)[0] - base
+    leaning = nominal.joint_targets(state, stance, forwards, STILL)[0] - base
     assert leaning[0, joint_index("left_ankle_pitch_joint")] > 0.1  # toes down pushes the body back
 
 
@@ -199,11 +248,11 @@ def test_the_pelvis_gives_way_to_outstretched_arms(space: CommandSpace) -> None:
     reaching[:, ARMS.start + 1] = 0.8
 
     def center_over_feet(nominal: NominalMotion, posture: torch.Tensor) -> np.ndarray:
-        state = nominal.initial_state(posture)
+        state = NominalState.standing(posture)
         torque_free = replace(GAINS["stiff"], stiffness=np.full(29, np.inf))
         nominal = NominalMotion(nominal.config, torque_free, control_period=0.02)
         q = pin.neutral(model)
-        q[7:] = nominal.joint_targets(state, UPRIGHT, STILL)[0][0].double().numpy()
+        q[7:] = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0][0].double().numpy()
         pin.framesForwardKinematics(model, data, q)
         feet = [data.oMf[model.getFrameId(name)].translation for name in FOOT_BODIES]
         return pin.centerOfMass(model, data, q)[:2] - np.mean(feet, axis=0)[:2]
@@ -217,6 +266,26 @@ def test_the_pelvis_gives_way_to_outstretched_arms(space: CommandSpace) -> None:
     np.testing.assert_allclose(center_over_feet(carrying, command), at_rest, atol=1e-6)
 
 
+def test_arms_bear_their_own_weight(space: CommandSpace) -> None:
+    """Lead of the arm targets times stiffness against Pinocchio's gravity torques, torso tilted."""
+    model = build_model()
+    data = model.createData()
+    command = space.neutral()[None].clone()
+    command[:, TORSO] = torch.tensor([0.2, 0.6, -0.4])
+    command[:, HEIGHT] = 0.6
+    command[:, ARMS] += 0.5 * torch.linspace(-1.0, 1.0, 14)
+    state = NominalState.standing(command)
+    leading = motion().joint_targets(state, DEFAULT, UPRIGHT, STILL)[0]
+    lead = (leading[0, ARM_JOINTS] - command[0, ARMS]).double().numpy()
+    waist = motion().pose.lookup(command[:, POSTURE]).position[:, WAIST_JOINTS]
+    q = pin.neutral(model)
+    q[3:7] = motion().pelvis_attitude(command[:, TORSO], waist)[0][[1, 2, 3, 0]].double().numpy()
+    q[7:][WAIST_JOINTS], q[7:][ARM_JOINTS] = waist[0].double().numpy(), command[0, ARMS].double().numpy()
+    expected = pin.computeGeneralizedGravity(model, data, q)[6:][ARM_JOINTS]
+    assert np.abs(expected).max() > 2.0
+    np.testing.assert_allclose(lead * GAINS["stiff"].stiffness[ARM_JOINTS], expected, atol=1e-3)
+
+
 def test_waist_and_hips_bear_the_moment_of_the_arms(space: CommandSpace) -> None:
     """Waist torques against the change of Pinocchio's gravity torques, pelvis held."""
     model = build_model()
@@ -228,7 +297,8 @@ def test_waist_and_hips_bear_the_moment_of_the_arms(space: CommandSpace) -> None
     command[:, ARMS] += 0.4 * torch.linspace(-1.0, 1.0, 14)
     stance = nominal.pose.lookup(command[:, POSTURE])
     position = stance.position
-    loaded = nominal._carry_arms(command[:, ARMS], stance, nominal._attitude(command, position))
+    attitude = nominal._attitude(command, position, DEFAULT)
+    loaded = nominal._carry_arms(nominal.arm_mass.first_moment(command[:, ARMS]), stance, attitude)
     added = (loaded.torque - stance.torque)[0, WAIST_JOINTS].double().numpy()
 
     def gravity(arms: np.ndarray) -> np.ndarray:

@@ -1,0 +1,81 @@
+"""Constants of the nominal motion that :mod:`lowlevel.nominal` computes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class NominalConfig:
+    """Nominal motion that the policy's action corrects."""
+
+    kind: Literal["default", "pose", "march"] = "march"
+    """``default``: legs and waist around the default pose; ``pose``: around the nominal-pose table;
+    ``march``: the table plus a feed-forward march while walking."""
+    gait_clock: bool = True
+    """Show the gait clock to the policy (sine and cosine, zero while standing); an addition to the paper."""
+    gait_frequency: float = 2.0
+    """Steps of one foot per second [Hz]."""
+    velocity_rate: float = 1.0
+    """Slew rate of the velocity reference [m/s^2] and [rad/s^2]: steps go on until the robot has slowed down."""
+    height_rate: float = 0.25
+    """Slew rate of the base height reference [m/s]."""
+    torso_rate: float = 1.0
+    """Slew rate of the torso attitude reference [rad/s]."""
+    arm_rate: float = 4.0
+    """Slew rate of the arm reference [rad/s]."""
+    stopping_time: float = 1.8
+    """A march outlasts a command to stop by this long per speed that was to be lost [s per m/s]; less than
+    1 / velocity_rate: it ends with the velocity reference."""
+    walking_ramp: float = 0.2
+    """Time over which the march fades in and out [s]."""
+    settling_time: float = 0.5
+    """A robot told to stand keeps its posture until its march has been over for this long [s]; 0: it does not wait
+    for the march either."""
+    knee_lift: float = 0.72
+    """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
+    lateral_shift: float = 0.035
+    """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
+    stride: tuple[float, float, float] = (0.122, 0.083, 0.132)
+    """Hip swing per commanded vx, vy [rad per m/s] and yaw rate [rad per rad/s]. A foot that lands half a step ahead
+    of the hip keeps the speed; one further ahead brakes."""
+    side_step_turn: float = 0.27
+    """Yaw rate added per commanded vy [rad/s per m/s]: stepping sideways turns the robot by as much."""
+    twist: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Turn of the pelvis by both hip yaws in time with the gait, which takes back the march's own swing: sine and
+    cosine parts [rad], and what a commanded vx adds to them [rad per m/s]."""
+    carry_arms: bool = True
+    """Shift the pelvis against the arms' weight and bear its moment; False: as if the arms hung at their default."""
+    largest_shift: float = 0.08
+    """Largest such shift along x and along y [m]."""
+    bear_arms: bool = True
+    """Arm targets lead by what gravity would make the arms sag."""
+    torso_trim_rate: float = 0.5
+    """Rate at which waist roll and pitch take up a lasting torso error [rad/s per rad]; 0 switches that off."""
+    largest_torso_trim: float = 0.2
+    """Most that they take up [rad]."""
+    balance_stiffness: float = 3.2
+    """Ankle correction per tilt of the pelvis off its nominal attitude [rad/rad]; 0 switches the strategy off."""
+    balance_damping: float = 0.245
+    """Ankle correction per tilt rate [rad per rad/s]."""
+    step_stiffness: float = 1.5
+    """While marching: hip correction per tilt [rad/rad]; the swing foot steps towards the fall, the stance hip
+    rights the body."""
+    step_damping: float = 0.17
+    """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
+    lean: tuple[float, float] = (0.277, 0.304)
+    """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
+    chase it carry the robot along."""
+    largest_lean: float = 0.4
+    """Largest lean along x and along y [rad]."""
+    steady_time: float = 2.0
+    """Time constant of the slow average of the tilt, which is no unbalance [s]; 0: all of it is."""
+    stepping_threshold: float = 0.4
+    """:attr:`NominalState.unbalance` from which a standing robot marches to catch itself [rad]."""
+    stepping_time: float = 0.8
+    """How long it then marches [s]."""
+    stepping_height: float = 0.55
+    """Lowest base height reference at which it does: a deep squat leaves the legs no room [m]."""
+    stepping_torso: tuple[float, float, float] = (0.2, 0.5, 0.5)
+    """Largest torso roll, pitch and yaw references at which it does [rad]."""
