@@ -297,7 +297,12 @@ class NominalMotion:
         velocity = torch.stack([vx, vy, yaw_rate + config.side_step_turn * vy], dim=1)
         stride = cosine[:, None] * velocity * self._stride
         sine_part, cosine_part, sine_slope, cosine_slope = config.twist
-        twist = (sine_part + sine_slope * vx) * sine + (cosine_part + cosine_slope * vx) * cosine
+        forwards = vx.clamp_min(0.0)
+        twist = (sine_part + sine_slope * forwards) * sine + (cosine_part + cosine_slope * forwards) * cosine
+        turning_sine, turning_cosine = config.turning_twist
+        double_phase = 2.0 * state.phase
+        jerk = turning_sine * torch.sin(double_phase) + turning_cosine * torch.cos(double_phase)
+        twist = twist + state.walking * yaw_rate * jerk
         parts = (config.knee_lift * raised, config.lateral_shift * sine[:, None], stride, twist[:, None])
         return torch.cat(parts, dim=1)
 

@@ -37,14 +37,17 @@ class NominalConfig:
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
     lateral_shift: float = 0.035
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
-    stride: tuple[float, float, float] = (0.122, 0.083, 0.132)
+    stride: tuple[float, float, float] = (0.122, 0.083, 0.15)
     """Hip swing per commanded vx, vy [rad per m/s] and yaw rate [rad per rad/s]. A foot that lands half a step ahead
     of the hip keeps the speed; one further ahead brakes."""
     side_step_turn: float = 0.27
     """Yaw rate added per commanded vy [rad/s per m/s]: stepping sideways turns the robot by as much."""
-    twist: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    twist: tuple[float, float, float, float] = (-0.032, -0.006, 0.03, 0.065)
     """Turn of the pelvis by both hip yaws in time with the gait, which takes back the march's own swing: sine and
-    cosine parts [rad], and what a commanded vx adds to them [rad per m/s]."""
+    cosine parts [rad], and what a commanded vx > 0 adds to them [rad per m/s]."""
+    turning_twist: tuple[float, float] = (-0.07, 0.02)
+    """The same at twice the frequency, against the jerks of turning: sine and cosine parts per yaw rate
+    [rad per rad/s]."""
     carry_arms: bool = True
     """Shift the pelvis against the arms' weight and bear its moment; False: as if the arms hung at their default."""
     largest_shift: float = 0.08
