@@ -31,6 +31,7 @@ class Buffers:
     foot_air_time: Tensor
     foot_contact_time: Tensor
     hand_force: Tensor
+    velocity: Tensor
 
     @classmethod
     def empty(cls, neutral: Tensor) -> Buffers:
@@ -55,4 +56,5 @@ class Buffers:
             foot_air_time=zeros(2),
             foot_contact_time=zeros(2),
             hand_force=zeros(2, 3),
+            velocity=zeros(3),
         )

@@ -109,7 +109,11 @@ class ControlStep(nn.Module):
         output = self.actor(history.flatten(1), map_observation(elevation_map), flag)
         action = output.mean.clamp(-self.action_limit, self.action_limit)
         nominal_target, state = self.motion.joint_targets(
-            state, measured.joint_position, measured.projected_gravity, measured.base_angular_velocity
+            state,
+            measured.joint_position,
+            measured.projected_gravity,
+            measured.base_angular_velocity,
+            output.velocity,
         )
         remembered = Memory(state, action, history, torch.zeros_like(memory.is_fresh))
         return StepResult(nominal_target + action * self._action_scale, output.gate, remembered)

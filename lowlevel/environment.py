@@ -156,11 +156,18 @@ class PilotEnvironment:
                 self.max_steps, (self.num_robots,), generator=self.generator, device=self.device
             )
         self._advance_nominal()
-        return self._observe(take_snapshot(self.simulation.read(), self.terrain), everyone)
+        now = take_snapshot(self.simulation.read(), self.terrain)
+        self.buffers.velocity = now.measured.linear_velocity
+        return self._observe(now, everyone)
 
-    def step(self, action: Tensor) -> StepResult:
-        """Apply residual ``action`` (N, 29) for one control step of 0.02 s."""
+    def step(self, action: Tensor, estimated_velocity: Tensor | None = None) -> StepResult:
+        """Apply residual ``action`` (N, 29) for one control step of 0.02 s.
+
+        ``estimated_velocity`` (N, 3) [m/s]: the policy's estimate of the base velocity in the heading frame, which
+        the nominal motion steers by; the true one by default.
+        """
         buffers = self.buffers
+        velocity = buffers.velocity if estimated_velocity is None else estimated_velocity
         action = action.clamp(-self.config.action_limit, self.config.action_limit)
         frame = split_frame(buffers.history[:, -1])
         nominal_target, buffers.nominal = self.motion.joint_targets(
@@ -168,6 +175,7 @@ class PilotEnvironment:
             frame["joint_position"] + self.motion.default,
             frame["projected_gravity"],
             frame["base_angular_velocity"],
+            velocity,
         )
         target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
         applied = torch.where(self.randomizer.state.is_delayed, buffers.previous_target, target)
@@ -202,6 +210,7 @@ class PilotEnvironment:
         if len(done):
             self._reset_robots(done)
             now = with_rows(now, done, take_snapshot(self.simulation.read(done), self.terrain))
+        buffers.velocity = now.measured.linear_velocity
         buffers.hand_force = self.randomizer.disturb(now.measured.robot, now.measured.heading)
         self._resample_due_commands()
         self._advance_nominal()

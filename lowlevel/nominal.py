@@ -105,6 +105,8 @@ class NominalState(NamedTuple):
     where the body is heading. Zero without the balance strategy."""
     steady_tilt: Tensor
     """Slow average of the tilt about x and y (N, 2) [rad]."""
+    velocity_trim: Tensor
+    """What the march adds to the velocity reference against a lasting error (N, 3) [m/s, m/s, rad/s]."""
     torso_trim: Tensor
     """What waist roll and pitch take up of a lasting torso error (N, 2) [rad]."""
 
@@ -115,7 +117,7 @@ class NominalState(NamedTuple):
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(len(reference), *shape, device=reference.device)
 
-        return cls(reference, zeros(), zeros(), zeros(), zeros(), zeros(), zeros(), zeros(2), zeros(2))
+        return cls(reference, zeros(), zeros(), zeros(), zeros(), zeros(), zeros(), zeros(2), zeros(3), zeros(2))
 
 
 class _Attitude(NamedTuple):
@@ -229,14 +231,20 @@ class NominalMotion:
         return multiply(from_roll_pitch_yaw(torso), conjugate(multiply(about_axis(2, yaw), tilted)))
 
     def joint_targets(
-        self, state: NominalState, joint_position: Tensor, projected_gravity: Tensor, base_angular_velocity: Tensor
+        self,
+        state: NominalState,
+        joint_position: Tensor,
+        projected_gravity: Tensor,
+        base_angular_velocity: Tensor,
+        velocity: Tensor,
     ) -> tuple[Tensor, NominalState]:
         """Nominal PD targets (N, 29) [rad], gravity compensated by static torques, and the state of the feedback.
 
         They may lie beyond the joint limits: a joint that rests at its limit needs such a target to push against it.
 
         ``joint_position`` (N, 29) [rad], ``projected_gravity`` (N, 3) and ``base_angular_velocity`` (N, 3) [rad/s] as
-        measured, the last two in the pelvis frame.
+        measured, the last two in the pelvis frame. ``velocity`` (N, 3) [m/s]: of the base in the heading frame, as
+        the policy estimates it; the third component plays no role.
         """
         config, arms = self.config, state.reference[:, ARMS]
         if config.kind == "default":
@@ -251,6 +259,8 @@ class NominalMotion:
                 arms = arms + torque * self._inverse_arm_stiffness
         targets = torch.cat([stance.position + stance.torque * self._inverse_stiffness, arms], dim=1)
         if config.kind == "march":
+            yaw_rate = -(base_angular_velocity * projected_gravity).sum(dim=1, keepdim=True)
+            state = self._trim_velocity(state, torch.cat([velocity[:, :2], yaw_rate], dim=1))
             targets = torch.addmm(targets, self._march(state), self._march_joints)
         if config.balance_stiffness > 0.0:
             balance, state = self._balance(state, attitude, projected_gravity, base_angular_velocity)
@@ -288,12 +298,22 @@ class NominalMotion:
         borne = torch.stack([about_yaw, about_roll, load[:, 1], sideways], dim=1)
         return NominalStance(position, torch.addmm(stance.torque, borne, self._bearing_joints), stance.shift)
 
+    def _trim_velocity(self, state: NominalState, velocity: Tensor) -> NominalState:
+        """Integrate the error of ``velocity`` (N, 3) while the robot marches."""
+        config, wanted = self.config, state.reference[:, VELOCITY]
+        trim = state.velocity_trim + config.velocity_trim_rate * self.control_period * (wanted - velocity)
+        constant, share = config.velocity_trim_share
+        bound = constant + share * wanted.norm(dim=1, keepdim=True)
+        return state._replace(velocity_trim=trim.clamp(-bound, bound) * state.walking[:, None])
+
     def _march(self, state: NominalState) -> Tensor:
         """How much of each row of ``_MARCH`` there is (N, 7) [rad]."""
         config = self.config
         sine, cosine = torch.sin(state.phase) * state.walking, torch.cos(state.phase) * state.walking
         raised = torch.stack([sine, -sine], dim=1).clamp_min(0.0)
-        vx, vy, yaw_rate = state.reference[:, VELOCITY].unbind(1)
+        if config.soft_landing:
+            raised = raised.square()
+        vx, vy, yaw_rate = (state.reference[:, VELOCITY] + state.velocity_trim).unbind(1)
         velocity = torch.stack([vx, vy, yaw_rate + config.side_step_turn * vy], dim=1)
         stride = cosine[:, None] * velocity * self._stride
         sine_part, cosine_part, sine_slope, cosine_slope = config.twist
@@ -316,7 +336,7 @@ class NominalMotion:
         the swing hip moves the foot that way.
         """
         config, walking = self.config, state.walking[:, None]
-        lean = state.reference[:, VELOCITY] * self._lean
+        lean = (state.reference[:, VELOCITY] + state.velocity_trim) * self._lean
         lean = lean.clamp(-config.largest_lean, config.largest_lean) * walking
         upright = -attitude.torso[:, 2]
         wanted = lean + (attitude.waist @ upright[:, :, None])[:, :, 0]

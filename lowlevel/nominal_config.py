@@ -35,6 +35,8 @@ class NominalConfig:
     for the march either."""
     knee_lift: float = 0.72
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
+    soft_landing: bool = True
+    """The foot comes to rest as it lands; False: it follows a sine and stamps down at 1 m/s."""
     lateral_shift: float = 0.035
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
     stride: tuple[float, float, float] = (0.122, 0.083, 0.15)
@@ -48,6 +50,11 @@ class NominalConfig:
     turning_twist: tuple[float, float] = (-0.07, 0.02)
     """The same at twice the frequency, against the jerks of turning: sine and cosine parts per yaw rate
     [rad per rad/s]."""
+    velocity_trim_rate: float = 0.7
+    """Rate at which the march takes up a lasting error of the estimated velocity and the measured yaw rate
+    [m/s^2 per m/s]; 0 switches that off."""
+    velocity_trim_share: tuple[float, float] = (0.05, 0.25)
+    """Most that it takes up in each component: a constant [m/s, rad/s], and a share of the commanded speed."""
     carry_arms: bool = True
     """Shift the pelvis against the arms' weight and bear its moment; False: as if the arms hung at their default."""
     largest_shift: float = 0.08

@@ -78,6 +78,8 @@ class PPO:
         self.critic = self.learner.critic
         self.generator = torch.Generator(self.device).manual_seed(seed + 1000 * rank())
         self._noise: Tensor | None = None
+        self.estimated_velocity = torch.zeros(num_envs, VELOCITY_SIZE, device=self.device)
+        """Base velocity (N, 3) [m/s] in the heading frame, as the last action's observation tells."""
         widths = {"history": sizes.history, "elevation_map": sizes.elevation_map, "flag": 1}
         widths |= {"privileged": sizes.privileged, "next_privileged": sizes.privileged}
         widths |= {"action": sizes.action, "mean": sizes.action}
@@ -119,6 +121,7 @@ class PPO:
             "log_prob": self.learner.log_prob(output.mean, action),
         }
         self.storage.write({**observation, **estimates, **acted})
+        self.estimated_velocity = output.velocity
         return action
 
     def _draw_noise(self, like: Tensor) -> Tensor:
@@ -130,8 +133,10 @@ class PPO:
 
     @torch.no_grad()
     def deterministic(self, observation: Mapping[str, Tensor]) -> Tensor:
-        """Mean actions (N, A), without noise; nothing is stored."""
-        return self.learner.policy({key: observation[key].to(self.device) for key in ACTOR_KEYS}).mean
+        """Mean actions (N, A), without noise; nothing is stored but :attr:`estimated_velocity`."""
+        output = self.learner.policy({key: observation[key].to(self.device) for key in ACTOR_KEYS})
+        self.estimated_velocity = output.velocity
+        return output.mean
 
     def record(self, reward: Tensor, terminated: Tensor, truncated: Tensor, next_privileged: Tensor) -> None:
         """Store what followed the last :meth:`act`.

@@ -162,7 +162,7 @@ SWING_HEIGHT = 0.08
 
 def foot_phase(t: Transition) -> Tensor:
     """Kernel on the sole heights against the gait clock, variance 0.005 m^2."""
-    lift = torch.stack([torch.sin(t.phase), -torch.sin(t.phase)], dim=-1).clamp_min(0.0)
+    lift = torch.stack([torch.sin(t.phase), -torch.sin(t.phase)], dim=-1).clamp_min(0.0).square()
     wanted = SWING_HEIGHT * lift * t.walking[:, None]
     return torch.exp(-(t.measured.foot_clearance - wanted).square().sum(-1) / 0.005)
 

@@ -151,7 +151,7 @@ class Trainer:
         started = time.monotonic()
         for _ in range(self.config.ppo.steps_per_update):
             action = self.ppo.act(self.observation)
-            result = self.environment.step(action.cpu())
+            result = self.environment.step(action.cpu(), self.ppo.estimated_velocity.cpu())
             self.ppo.record(result.reward, result.terminated, result.truncated, result.next_privileged)
             self.observation = result.observation
             terms.add(result.terms | {"total": result.reward / self.environment.control_period})

@@ -1,6 +1,7 @@
 """The command space and its sampling (paper III-B-5)."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -51,6 +52,19 @@ def test_shares_of_the_mixture(space: CommandSpace) -> None:
     assert flag.mean().item() == pytest.approx(0.8, abs=0.03)
     assert (walks & (flag[:, 0] == 0)).float().mean().item() == pytest.approx(0.2, abs=0.03)
     assert (~walks).float().mean().item() == pytest.approx(0.4, abs=0.04)
+
+
+def test_slow_commands_are_slower_by_their_scale(space: CommandSpace) -> None:
+    walking = CommandMixture(walk_and_work=1.0, stand_and_work=0.0)
+
+    def speeds(mixture: CommandMixture) -> torch.Tensor:
+        sampler = CommandSampler(space, mixture)
+        return sampler.sample(4000, CommandRange(), torch.Generator().manual_seed(0))[0][:, VELOCITY].abs()
+
+    some, none = speeds(replace(walking, slow=0.5, slow_scale=0.2)), speeds(walking)
+    fast = [(speed[:, 0] > 0.2 * 1.2).float().mean().item() for speed in (some, none)]
+    assert fast[0] == pytest.approx(0.5 * fast[1], abs=0.03)
+    assert some.mean().item() == pytest.approx((0.5 + 0.5 * 0.2) * none.mean().item(), rel=0.05)
 
 
 def test_the_stand_share_stands_in_the_neutral_posture(space: CommandSpace) -> None:

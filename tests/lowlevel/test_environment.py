@@ -140,6 +140,20 @@ def test_falls_terminate_and_time_limits_truncate() -> None:
     assert torch.stack([result.terminated for result in everything]).any(dim=0).all()
 
 
+def test_robots_start_just_above_the_ground_as_fast_as_configured() -> None:
+    config = replace(QUIET, num_robots=64, terrain=TerrainConfig(tiles=("irregular",)))
+    for fastest in (0.0, 0.3):
+        environment = PilotEnvironment(
+            replace(config, randomization=replace(QUIET.randomization, start_velocity=fastest))
+        )
+        environment.reset()
+        state = environment.simulation.read()
+        soles = state.foot_position
+        gaps = soles[..., 2] - environment.terrain.height(soles[..., :2])
+        assert (gaps > 0.0).all() and gaps.mean() < 0.035
+        assert state.base_linear_velocity[:, :2].abs().max().item() == pytest.approx(fastest, abs=0.02)
+
+
 def test_successor_state_is_the_one_before_the_reset() -> None:
     environment = PilotEnvironment(replace(QUIET, episode_length=0.1))
     environment.reset()
@@ -200,8 +214,9 @@ def test_frozen_controller_repeats_the_training_policy(tmp_path) -> None:
             environment.buffers.command,
             environment.buffers.flag,
         )
-        reference = environment.buffers.reference.clone()
-        result = environment.step(trainer.ppo.deterministic(observation))
+        reference = environment.buffers.nominal.reference.clone()
+        action = trainer.ppo.deterministic(observation)
+        result = environment.step(action, trainer.ppo.estimated_velocity)
         observation = result.observation
         assert torch.allclose(targets, environment.buffers.previous_target, atol=2e-5)
         assert torch.allclose(controller.reference, reference, atol=1e-5)

@@ -86,7 +86,7 @@ def test_a_robot_that_tips_over_marches_for_a_while(space: CommandSpace) -> None
     nominal = motion()
     stand = space.neutral()[None]
     spinning = torch.tensor([[0.0, 3.0, 0.0]])
-    state = nominal.joint_targets(NominalState.standing(stand), DEFAULT, UPRIGHT, spinning)[1]
+    state = nominal.joint_targets(NominalState.standing(stand), DEFAULT, UPRIGHT, spinning, STILL)[1]
     assert state.unbalance.item() == pytest.approx(3.0 * nominal.config.step_damping, abs=0.02)
     state = nominal.advance(state, stand)._replace(unbalance=torch.zeros(1))
     marched = 0
@@ -101,9 +101,9 @@ def test_a_lasting_tilt_is_no_unbalance(space: CommandSpace) -> None:
     for steady_time, lowest, highest in ((2.0, 0.0, 0.1), (0.0, 0.15, 0.25)):
         nominal = motion(steady_time=steady_time)
         state = NominalState.standing(space.neutral()[None])
-        first = nominal.joint_targets(state, DEFAULT, leaning, STILL)[1]
+        first = nominal.joint_targets(state, DEFAULT, leaning, STILL, STILL)[1]
         for _ in range(250):
-            state = nominal.joint_targets(state, DEFAULT, leaning, STILL)[1]
+            state = nominal.joint_targets(state, DEFAULT, leaning, STILL, STILL)[1]
         assert first.unbalance.item() > 0.15
         assert lowest <= state.unbalance.item() < highest
 
@@ -116,13 +116,13 @@ def test_the_waist_takes_up_a_lasting_torso_error(space: CommandSpace) -> None:
     gravity = torch.tensor(tilted, dtype=torch.float32)[None]
     straight = DEFAULT.clone()
     straight[:, WAIST_JOINTS] = 0.0
-    before = nominal.joint_targets(state, straight, UPRIGHT, STILL)[0]
+    before = nominal.joint_targets(state, straight, UPRIGHT, STILL, STILL)[0]
     for _ in range(50):
-        targets, state = nominal.joint_targets(state, straight, gravity, STILL)
+        targets, state = nominal.joint_targets(state, straight, gravity, STILL, STILL)
     moved = (targets - before)[0, WAIST_JOINTS]
     assert moved.tolist() == pytest.approx([0.0, -0.05 * 0.5, -0.1 * 0.5], abs=2e-3)
     for _ in range(500):
-        targets, state = nominal.joint_targets(state, straight, gravity, STILL)
+        targets, state = nominal.joint_targets(state, straight, gravity, STILL, STILL)
     assert state.torso_trim[0, 1].item() == pytest.approx(nominal.config.largest_torso_trim)
 
 
@@ -177,6 +177,22 @@ def test_a_robot_told_to_stop_settles_before_it_changes_posture(space: CommandSp
     assert torch.equal(tracked[:, VELOCITY.stop :], squat[:, VELOCITY.stop :])
 
 
+def test_the_march_takes_up_a_lasting_velocity_error_within_bounds(space: CommandSpace) -> None:
+    nominal = motion(velocity_trim_rate=0.5, velocity_trim_share=(0.05, 0.4))
+    command = space.neutral()[None].clone()
+    command[:, VELOCITY] = torch.tensor([0.6, 0.0, 0.0])
+    state = NominalState.standing(command)._replace(walking=torch.ones(1))
+    turning = torch.tensor([[0.0, 0.0, 0.1]])
+    for _ in range(20):
+        state = nominal.joint_targets(state, DEFAULT, UPRIGHT, turning, torch.tensor([[0.4, 0.1, 9.0]]))[1]
+    assert state.velocity_trim[0].tolist() == pytest.approx([0.5 * 0.2 * 0.4, -0.5 * 0.1 * 0.4, -0.5 * 0.1 * 0.4])
+    for _ in range(500):
+        state = nominal.joint_targets(state, DEFAULT, UPRIGHT, turning, torch.zeros(1, 3))[1]
+    assert state.velocity_trim[0, 0].item() == pytest.approx(0.05 + 0.4 * 0.6)
+    standing = nominal.joint_targets(state._replace(walking=torch.zeros(1)), DEFAULT, UPRIGHT, STILL, STILL)[1]
+    assert not standing.velocity_trim.any()
+
+
 def test_a_robot_in_a_deep_squat_does_not_march(space: CommandSpace) -> None:
     nominal = motion()
     squat = space.neutral()[None].clone()
@@ -190,10 +206,10 @@ def test_arms_follow_the_reference_in_every_kind(space: CommandSpace) -> None:
     command[:, ARMS] += 0.1
     for kind in ("default", "pose", "march"):
         nominal = motion(kind=kind, bear_arms=False)
-        targets = nominal.joint_targets(NominalState.standing(command), DEFAULT, UPRIGHT, STILL)[0]
+        targets = nominal.joint_targets(NominalState.standing(command), DEFAULT, UPRIGHT, STILL, STILL)[0]
         assert torch.allclose(targets[:, ARM_JOINTS], command[:, ARMS])
     default = motion(kind="default")
-    legs = default.joint_targets(NominalState.standing(command), DEFAULT, UPRIGHT, STILL)[0][0, :15]
+    legs = default.joint_targets(NominalState.standing(command), DEFAULT, UPRIGHT, STILL, STILL)[0][0, :15]
     assert torch.allclose(legs, torch.tensor(DEFAULT_POSITION[:15], dtype=torch.float32))
 
 
@@ -205,18 +221,18 @@ def test_march_half_a_period_later_is_the_mirror_image(space: CommandSpace) -> N
     state.walking[:] = 1.0
     for phase in (0.4, 1.3, 2.9):
         state.phase[:] = phase
-        now = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0]
+        now = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL, STILL)[0]
         state.phase[:] = phase + np.pi
-        later = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0]
+        later = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL, STILL)[0]
         assert np.allclose(JOINTS_MIRROR(now.numpy()), later.numpy(), atol=2e-3)
 
 
 def test_march_lifts_the_swing_leg_only(space: CommandSpace) -> None:
     nominal = motion()
     state = NominalState.standing(space.neutral()[None])
-    rest = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0]
+    rest = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL, STILL)[0]
     state.walking[:], state.phase[:] = 1.0, np.pi / 2
-    lifted = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0] - rest
+    lifted = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL, STILL)[0] - rest
     assert lifted[0, joint_index("left_knee_joint")].item() == pytest.approx(nominal.config.knee_lift, abs=1e-5)
     assert lifted[0, joint_index("right_knee_joint")].item() == pytest.approx(0.0, abs=1e-6)
 
@@ -229,10 +245,10 @@ def test_ankles_push_against_tilt_and_vanish_at_the_nominal_attitude(space: Comm
     attitude = nominal.pelvis_attitude(state.reference[:, TORSO], stance[:, WAIST_JOINTS])
     rotation = pin.Quaternion(*attitude[0].double().tolist()).toRotationMatrix()
     nominal_gravity = torch.tensor(rotation.T @ np.array([0, 0, -1.0]), dtype=torch.float32)[None]
-    base = without.joint_targets(state, stance, nominal_gravity, STILL)[0]
-    assert torch.allclose(nominal.joint_targets(state, stance, nominal_gravity, STILL)[0], base, atol=1e-6)
+    base = without.joint_targets(state, stance, nominal_gravity, STILL, STILL)[0]
+    assert torch.allclose(nominal.joint_targets(state, stance, nominal_gravity, STILL, STILL)[0], base, atol=1e-6)
     forwards = torch.tensor([[np.sin(0.1), 0.0, -np.cos(0.1)]], dtype=torch.float32)
-    leaning = nominal.joint_targets(state, stance, forwards, STILL)[0] - base
+    leaning = nominal.joint_targets(state, stance, forwards, STILL, STILL)[0] - base
     assert leaning[0, joint_index("left_ankle_pitch_joint")] > 0.1  # toes down pushes the body back
 
 
@@ -252,7 +268,7 @@ def test_the_pelvis_gives_way_to_outstretched_arms(space: CommandSpace) -> None:
         torque_free = replace(GAINS["stiff"], stiffness=np.full(29, np.inf))
         nominal = NominalMotion(nominal.config, torque_free, control_period=0.02)
         q = pin.neutral(model)
-        q[7:] = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL)[0][0].double().numpy()
+        q[7:] = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL, STILL)[0][0].double().numpy()
         pin.framesForwardKinematics(model, data, q)
         feet = [data.oMf[model.getFrameId(name)].translation for name in FOOT_BODIES]
         return pin.centerOfMass(model, data, q)[:2] - np.mean(feet, axis=0)[:2]
@@ -275,7 +291,7 @@ def test_arms_bear_their_own_weight(space: CommandSpace) -> None:
     command[:, HEIGHT] = 0.6
     command[:, ARMS] += 0.5 * torch.linspace(-1.0, 1.0, 14)
     state = NominalState.standing(command)
-    leading = motion().joint_targets(state, DEFAULT, UPRIGHT, STILL)[0]
+    leading = motion().joint_targets(state, DEFAULT, UPRIGHT, STILL, STILL)[0]
     lead = (leading[0, ARM_JOINTS] - command[0, ARMS]).double().numpy()
     waist = motion().pose.lookup(command[:, POSTURE]).position[:, WAIST_JOINTS]
     q = pin.neutral(model)

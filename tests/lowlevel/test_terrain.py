@@ -34,6 +34,17 @@ def test_heights_agree_with_ray_casting(terrain: Terrain) -> None:
         assert 2.0 - distance == pytest.approx(height, abs=1e-6)
 
 
+def test_the_highest_ground_is_that_of_the_slabs_within_reach(terrain: Terrain) -> None:
+    centers = torch.tensor([[0.3, 5.0], [-2.1, 3.3], [1.7, -4.0]])
+    found = terrain.highest(centers, 0.3)
+    for center, height in zip(centers, found, strict=True):
+        tops = [0.0]
+        for block in terrain.blocks:
+            apart = np.abs(np.array(block.center) - center.numpy()) - block.half_extent
+            tops += [block.top] if (apart < 0.3 - 1e-6).all() else []
+        assert height.item() == pytest.approx(max(tops), abs=1e-6)
+
+
 def test_irregularities_stay_within_two_centimetres_of_their_mean(terrain: Terrain) -> None:
     tops = np.array([block.top for block in terrain.blocks])
     assert tops.max() - tops.min() <= 0.04
