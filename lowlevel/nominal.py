@@ -162,6 +162,7 @@ class NominalMotion:
         self._turn_basis = torch.tensor(turn_basis(axes), dtype=torch.float32, device=device)
         self._stepping_torso = torch.tensor(config.stepping_torso, device=device)
         self._stride = torch.tensor(config.stride, device=device)
+        self._creep = torch.tensor([config.creep, 0.0, 0.0], device=device)
         self._lean = torch.tensor([*config.lean, 0.0], device=device)
         self._march_joints = _joints_moved(_MARCH, device)
         self._balance_joints = _joints_moved(_BALANCE, device)
@@ -306,16 +307,22 @@ class NominalMotion:
         bound = constant + share * wanted.norm(dim=1, keepdim=True)
         return state._replace(velocity_trim=trim.clamp(-bound, bound) * state.walking[:, None])
 
+    def _effort(self, state: NominalState) -> Tensor:
+        """Velocity (N, 3) that the march is to be made for, so that the reference's comes out."""
+        return state.reference[:, VELOCITY] + state.velocity_trim - self._creep
+
     def _march(self, state: NominalState) -> Tensor:
         """How much of each row of ``_MARCH`` there is (N, 7) [rad]."""
         config = self.config
         sine, cosine = torch.sin(state.phase) * state.walking, torch.cos(state.phase) * state.walking
-        raised = torch.stack([sine, -sine], dim=1).clamp_min(0.0)
+        lift = torch.sin(state.phase + config.lift_lead) * state.walking
+        raised = torch.stack([lift, -lift], dim=1).clamp_min(0.0)
         if config.soft_landing:
             raised = raised.square()
-        vx, vy, yaw_rate = (state.reference[:, VELOCITY] + state.velocity_trim).unbind(1)
+        vx, vy, yaw_rate = self._effort(state).unbind(1)
         velocity = torch.stack([vx, vy, yaw_rate + config.side_step_turn * vy], dim=1)
-        stride = cosine[:, None] * velocity * self._stride
+        swing = torch.cos(state.phase + config.stride_lead) * state.walking
+        stride = swing[:, None] * velocity * self._stride
         sine_part, cosine_part, sine_slope, cosine_slope = config.twist
         forwards = vx.clamp_min(0.0)
         twist = (sine_part + sine_slope * forwards) * sine + (cosine_part + cosine_slope * forwards) * cosine
@@ -336,7 +343,7 @@ class NominalMotion:
         the swing hip moves the foot that way.
         """
         config, walking = self.config, state.walking[:, None]
-        lean = (state.reference[:, VELOCITY] + state.velocity_trim) * self._lean
+        lean = self._effort(state) * self._lean
         lean = lean.clamp(-config.largest_lean, config.largest_lean) * walking
         upright = -attitude.torso[:, 2]
         wanted = lean + (attitude.waist @ upright[:, :, None])[:, :, 0]
@@ -344,7 +351,7 @@ class NominalMotion:
         rate = angular_velocity[:, :2]
         ankle = config.balance_stiffness * tilt + config.balance_damping * rate
         capture = config.step_stiffness * tilt + config.step_damping * rate
-        swing = torch.sin(state.phase)[:, None] * walking
+        swing = torch.sin(state.phase + config.capture_lead)[:, None] * walking
 
         steady_tilt = state.steady_tilt
         if config.steady_time > 0.0:

@@ -33,21 +33,30 @@ class NominalConfig:
     settling_time: float = 0.5
     """A robot told to stand keeps its posture until its march has been over for this long [s]; 0: it does not wait
     for the march either."""
-    knee_lift: float = 0.72
+    knee_lift: float = 0.69
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
     soft_landing: bool = True
     """The foot comes to rest as it lands; False: it follows a sine and stamps down at 1 m/s."""
-    lateral_shift: float = 0.035
+    lateral_shift: float = 0.042
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
-    stride: tuple[float, float, float] = (0.122, 0.083, 0.15)
+    stride: tuple[float, float, float] = (0.14, 0.11, 0.12)
     """Hip swing per commanded vx, vy [rad per m/s] and yaw rate [rad per rad/s]. A foot that lands half a step ahead
     of the hip keeps the speed; one further ahead brakes."""
-    side_step_turn: float = 0.27
+    stride_lead: float = 0.9
+    """Phase by which the stride's targets lead the gait clock [rad]. The loaded hip follows about 0.8 rad late, and a
+    foot that still swings forwards as it lands brakes the robot."""
+    lift_lead: float = 0.1
+    """The same for the lift of the feet [rad]."""
+    capture_lead: float = -0.1
+    """The same for capture steps [rad]."""
+    creep: float = 0.17
+    """Forward velocity of the march in place, which is taken back [m/s]."""
+    side_step_turn: float = 0.1
     """Yaw rate added per commanded vy [rad/s per m/s]: stepping sideways turns the robot by as much."""
-    twist: tuple[float, float, float, float] = (-0.032, -0.006, 0.03, 0.065)
+    twist: tuple[float, float, float, float] = (-0.005, -0.01, 0.017, 0.022)
     """Turn of the pelvis by both hip yaws in time with the gait, which takes back the march's own swing: sine and
     cosine parts [rad], and what a commanded vx > 0 adds to them [rad per m/s]."""
-    turning_twist: tuple[float, float] = (-0.07, 0.02)
+    turning_twist: tuple[float, float] = (0.02, 0.03)
     """The same at twice the frequency, against the jerks of turning: sine and cosine parts per yaw rate
     [rad per rad/s]."""
     velocity_trim_rate: float = 0.7
@@ -69,12 +78,12 @@ class NominalConfig:
     """Ankle correction per tilt of the pelvis off its nominal attitude [rad/rad]; 0 switches the strategy off."""
     balance_damping: float = 0.245
     """Ankle correction per tilt rate [rad per rad/s]."""
-    step_stiffness: float = 1.5
+    step_stiffness: float = 2.05
     """While marching: hip correction per tilt [rad/rad]; the swing foot steps towards the fall, the stance hip
     rights the body."""
-    step_damping: float = 0.17
+    step_damping: float = 0.2
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
-    lean: tuple[float, float] = (0.277, 0.304)
+    lean: tuple[float, float] = (0.07, 0.12)
     """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
     chase it carry the robot along."""
     largest_lean: float = 0.4

@@ -141,7 +141,7 @@ def _armature_gains() -> Gains:
 STIFF_GAINS = Gains(
     stiffness=_per_joint((150, 150, 150, 300, 40, 40), (200, 200, 200), (80, 80, 80, 80, 40, 40, 40)),
     damping=_per_joint((5, 5, 5, 8, 2, 2), (5, 5, 5), (3, 3, 3, 3, 1.5, 1.5, 1.5)),
-    action_scale=_per_joint((1 / 6, 1 / 6, 1 / 6, 0.125, 0.25, 0.25), (0.25,) * 3, (0.15,) * 7),
+    action_scale=_per_joint((1 / 6, 1 / 6, 1 / 6, 0.125, 0.25, 0.25), (0.25,) * 3, (0.08,) * 7),
 )
 SOFT_GAINS = _armature_gains()
 GAINS: dict[str, Gains] = {"stiff": STIFF_GAINS, "soft": SOFT_GAINS}

@@ -227,8 +227,24 @@ def test_march_half_a_period_later_is_the_mirror_image(space: CommandSpace) -> N
         assert np.allclose(JOINTS_MIRROR(now.numpy()), later.numpy(), atol=2e-3)
 
 
+def test_the_stride_leads_the_clock(space: CommandSpace) -> None:
+    command = space.neutral()[None].clone()
+    command[:, 0] = 0.8
+    state = NominalState.standing(command)._replace(walking=torch.ones(1))
+    hip = joint_index("left_hip_pitch_joint")
+
+    def stride(nominal: NominalMotion, phase: float) -> float:
+        moving = nominal.joint_targets(state._replace(phase=torch.tensor([phase])), DEFAULT, UPRIGHT, STILL, STILL)[0]
+        return moving[0, hip].item()
+
+    quiet = {"knee_lift": 0.0, "velocity_trim_rate": 0.0, "step_stiffness": 0.0, "step_damping": 0.0}
+    late, early = motion(stride_lead=0.0, **quiet), motion(stride_lead=0.5, **quiet)
+    assert stride(early, 0.3) == pytest.approx(stride(late, 0.8), abs=1e-5)
+    assert stride(early, 0.3) != pytest.approx(stride(late, 0.3), abs=1e-2)
+
+
 def test_march_lifts_the_swing_leg_only(space: CommandSpace) -> None:
-    nominal = motion()
+    nominal = motion(lift_lead=0.0)
     state = NominalState.standing(space.neutral()[None])
     rest = nominal.joint_targets(state, DEFAULT, UPRIGHT, STILL, STILL)[0]
     state.walking[:], state.phase[:] = 1.0, np.pi / 2
