@@ -39,7 +39,7 @@ class NominalConfig:
     """The foot comes to rest as it lands; False: it follows a sine and stamps down at 1 m/s."""
     lateral_shift: float = 0.042
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
-    stride: tuple[float, float, float] = (0.14, 0.11, 0.12)
+    stride: tuple[float, float, float] = (0.15, 0.12, 0.12)
     """Hip swing per commanded vx, vy [rad per m/s] and yaw rate [rad per rad/s]. A foot that lands half a step ahead
     of the hip keeps the speed; one further ahead brakes."""
     stride_lead: float = 0.9
@@ -49,20 +49,20 @@ class NominalConfig:
     """The same for the lift of the feet [rad]."""
     capture_lead: float = -0.1
     """The same for capture steps [rad]."""
-    creep: float = 0.17
+    creep: float = 0.14
     """Forward velocity of the march in place, which is taken back [m/s]."""
     side_step_turn: float = 0.1
     """Yaw rate added per commanded vy [rad/s per m/s]: stepping sideways turns the robot by as much."""
-    twist: tuple[float, float, float, float] = (-0.005, -0.01, 0.017, 0.022)
+    twist: tuple[float, float, float, float] = (-0.03, -0.03, 0.06, 0.09)
     """Turn of the pelvis by both hip yaws in time with the gait, which takes back the march's own swing: sine and
     cosine parts [rad], and what a commanded vx > 0 adds to them [rad per m/s]."""
-    turning_twist: tuple[float, float] = (0.02, 0.03)
+    turning_twist: tuple[float, float] = (0.0, -0.02)
     """The same at twice the frequency, against the jerks of turning: sine and cosine parts per yaw rate
     [rad per rad/s]."""
     velocity_trim_rate: float = 0.7
     """Rate at which the march takes up a lasting error of the estimated velocity and the measured yaw rate
     [m/s^2 per m/s]; 0 switches that off."""
-    velocity_trim_share: tuple[float, float] = (0.05, 0.25)
+    velocity_trim_share: tuple[float, float] = (0.05, 0.3)
     """Most that it takes up in each component: a constant [m/s, rad/s], and a share of the commanded speed."""
     carry_arms: bool = True
     """Shift the pelvis against the arms' weight and bear its moment; False: as if the arms hung at their default."""
@@ -83,7 +83,7 @@ class NominalConfig:
     rights the body."""
     step_damping: float = 0.2
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
-    lean: tuple[float, float] = (0.07, 0.12)
+    lean: tuple[float, float] = (0.09, 0.15)
     """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
     chase it carry the robot along."""
     largest_lean: float = 0.4
