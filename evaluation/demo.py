@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import tyro
 
-from evaluation.highlevel import SCRIPTED, make_policy
+from evaluation.highlevel import SCRIPTED, controller_for, make_policy
 from evaluation.pictures import NoOpenGLError, Painter, following_camera, save_picture
 from evaluation.recording import EpisodeRecording, Recorder
 from evaluation.reports import (
@@ -28,10 +28,9 @@ from evaluation.reports import (
 from evaluation.visuals import VisualTwin
 from highlevel.action import interpolate
 from highlevel.environment import CommandEnvironment, PhysicsConfig, StepResult
-from highlevel.planner import Planner, planner_hash
-from highlevel.registration import find_controller
+from highlevel.planner import planner_hash
 from highlevel.task import Decision, Outcome, Task, load_task, rows
-from lowlevel.controller import Controller, content_hash
+from lowlevel.controller import content_hash
 from lowlevel.measures import Measurement
 from lowlevel.progress import ProgressReport
 
@@ -47,7 +46,7 @@ class Arguments:
     task: str = "lift_box"
     """Name of the task."""
     controller: Path | None = None
-    """Controller folder; the shipped one if there is only one."""
+    """Controller folder; by default the shipped one of the planner, and pilot-g1-simple for the expert."""
     seed: int = 0
     """Seed of the episodes."""
     episode: int = 0
@@ -104,10 +103,7 @@ def _run(arguments: Arguments) -> None:
         raise ValueError("--episode must not be negative and --threads must be at least 1")
     load_task(arguments.task)
     check_output(arguments.output)
-    folder = find_controller(arguments.controller)
-    Controller.load(folder)
-    if arguments.planner != SCRIPTED:
-        Planner.load(arguments.planner, folder)
+    folder = controller_for(arguments.planner, arguments.controller)
     torch.set_num_threads(1)
     print(f"running {arguments.planner} on {arguments.task}, episode {arguments.episode}", flush=True)
     stories: list[Story] = []

@@ -53,7 +53,7 @@ class Arguments:
     task: str = "lift_box"
     """Name of the task."""
     controller: Path | None = None
-    """Controller folder; the shipped one if there is only one."""
+    """Controller folder; by default the shipped one of the planner, and pilot-g1-simple for the expert."""
     episodes: int = 500
     """Episodes; episode i of a seed is the same for every planner."""
     seed: int = 0
@@ -103,16 +103,29 @@ def _run(arguments: Arguments) -> None:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
     task = load_task(arguments.task)
     check_output(arguments.output)
-    folder = find_controller(arguments.controller)
-    Controller.load(folder)
-    if arguments.planner != SCRIPTED:
-        Planner.load(arguments.planner, folder)
+    folder = controller_for(arguments.planner, arguments.controller)
     torch.set_num_threads(1)
     print(f"evaluating {arguments.planner} on {task.name}", flush=True)
     evaluation = evaluate(arguments, folder)
     write_results(arguments.output, lambda output: write_report(output, evaluation))
     print(summary(evaluation))
     print(f"report: {arguments.output / REPORT_FILE}   figures: {arguments.output / METRICS_FILE}")
+
+
+def controller_for(planner: str, named: Path | None) -> Path:
+    """The ``named`` controller folder, or else the shipped one that the ``planner`` was trained on; both can be loaded.
+
+    Raises:
+        PlannerError, ControllerError, FileNotFoundError: if one of them cannot be used, or not with the other.
+    """
+    if planner == SCRIPTED:
+        folder = find_controller(named)
+    else:
+        loaded = Planner.load(planner)
+        folder = find_controller(named, loaded.config.controller)
+        loaded.require_controller(folder)
+    Controller.load(folder)
+    return folder
 
 
 def evaluate(arguments: Arguments, controller: Path) -> Evaluation:

@@ -27,7 +27,7 @@ class PlannerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Args:
         task: name of a task, or a task.
-        controller: folder of the controller, or a controller; the only shipped one by default.
+        controller: folder of the controller, or a controller; pilot-g1-simple by default.
         physics: accuracy and threads.
     """
 

@@ -7,9 +7,12 @@ from pathlib import Path
 import gymnasium
 
 from highlevel.task import environment_id, task_names
+from lowlevel.controller import content_hash
 
 CONTROLLERS = Path(__file__).resolve().parents[1] / "checkpoints" / "lowlevel"
 """Where shipped controllers lie."""
+DEFAULT_CONTROLLER = "pilot-g1-simple"
+"""The one of them that is used where none is asked for."""
 
 
 def register_tasks() -> None:
@@ -20,16 +23,18 @@ def register_tasks() -> None:
             gymnasium.register(identity, entry_point="highlevel.gym_env:PlannerEnv", kwargs={"task": name})
 
 
-def find_controller(folder: Path | str | None) -> Path:
-    """``folder``, or the only controller that is shipped if it is None.
+def find_controller(folder: Path | str | None = None, identity: str | None = None) -> Path:
+    """``folder`` if it is given; else the shipped controller of that ``identity``; else the default one.
 
     Raises:
-        FileNotFoundError: if none is named and there is not exactly one to choose.
+        FileNotFoundError: if no such controller is shipped.
     """
     if folder is not None:
         return Path(folder)
-    shipped = sorted(CONTROLLERS.glob("*/controller.json"))
-    if len(shipped) == 1:
-        return shipped[0].parent
-    found = ", ".join(path.parent.name for path in shipped) or "none"
-    raise FileNotFoundError(f"name a controller folder: {CONTROLLERS} holds these: {found}")
+    shipped = [path.parent for path in sorted(CONTROLLERS.glob("*/controller.json"))]
+    for candidate in shipped:
+        if candidate.name == DEFAULT_CONTROLLER if identity is None else content_hash(candidate) == identity:
+            return candidate
+    found = ", ".join(path.name for path in shipped) or "none"
+    wanted = DEFAULT_CONTROLLER if identity is None else identity
+    raise FileNotFoundError(f"name a controller folder: {wanted} is not among those in {CONTROLLERS}: {found}")

@@ -49,7 +49,7 @@ class PlannerTrainingConfig:
     task: str = "lift_box"
     """Name of a task: a folder under tasks/."""
     controller: Path | None = None
-    """Folder of the frozen controller; the only shipped one by default."""
+    """Folder of the frozen controller; pilot-g1-simple by default."""
     demonstrations: int = 500
     """Successful expert episodes to imitate first; 0 trains from nothing."""
     demonstration_file: Path | None = None

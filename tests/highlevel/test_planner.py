@@ -17,7 +17,7 @@ from highlevel.action import ActionConfig
 from highlevel.environment import CommandEnvironment
 from highlevel.planner import PLANNER_FILE, WEIGHTS_FILE, Planner, PlannerConfig, PlannerError, planner_hash
 from highlevel.policy import PlannerActor, PlannerNetwork, policy_arguments
-from highlevel.registration import find_controller
+from highlevel.registration import DEFAULT_CONTROLLER, find_controller
 from highlevel.task import load_task
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.controller import content_hash
@@ -117,8 +117,15 @@ def test_another_action_range_is_refused(planner: Planner, make_environment: Mak
         other.require_environment(make_environment())
 
 
-def test_the_shipped_planner_belongs_to_the_shipped_controller_and_task() -> None:
-    checkpoints = Path(__file__).resolve().parents[2] / "checkpoints"
-    controller = find_controller(None)
-    planner = Planner.load(checkpoints / "highlevel" / "lift-box", controller)
+def test_the_shipped_planner_finds_its_controller_and_fits_its_task() -> None:
+    planner = Planner.load(Path(__file__).resolve().parents[2] / "checkpoints" / "highlevel" / "lift-box")
+    controller = find_controller(identity=planner.config.controller)
+    planner.require_controller(controller)
     planner.require_environment(CommandEnvironment(load_task(planner.config.task), controller, 1))
+
+
+def test_controllers_are_found_by_folder_name_and_identity(tmp_path: Path) -> None:
+    assert find_controller(tmp_path) == tmp_path
+    assert find_controller().name == DEFAULT_CONTROLLER
+    with pytest.raises(FileNotFoundError, match="0123456789abcdef is not among"):
+        find_controller(identity="0123456789abcdef")
