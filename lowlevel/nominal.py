@@ -103,6 +103,10 @@ class NominalState(NamedTuple):
     unbalance: Tensor
     """Tilt off the nominal attitude and off its own slow average, plus ``step_damping`` times the tilt rate (N,) [rad]:
     where the body is heading. Zero without the balance strategy."""
+    gravity: Tensor
+    """Filtered gravity direction in the pelvis frame (N, 3); zero until the first measurement."""
+    tilt_rate: Tensor
+    """Filtered angular velocity about x and y in the pelvis frame (N, 2) [rad/s]."""
     steady_tilt: Tensor
     """Slow average of the tilt about x and y (N, 2) [rad]."""
     velocity_trim: Tensor
@@ -117,7 +121,20 @@ class NominalState(NamedTuple):
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(len(reference), *shape, device=reference.device)
 
-        return cls(reference, zeros(), zeros(), zeros(), zeros(), zeros(), zeros(), zeros(2), zeros(3), zeros(2))
+        return cls(
+            reference=reference,
+            phase=zeros(),
+            walking=zeros(),
+            stopping=zeros(),
+            stepping=zeros(),
+            settling=zeros(),
+            unbalance=zeros(),
+            gravity=zeros(3),
+            tilt_rate=zeros(2),
+            steady_tilt=zeros(2),
+            velocity_trim=zeros(3),
+            torso_trim=zeros(2),
+        )
 
 
 class _Attitude(NamedTuple):
@@ -250,6 +267,7 @@ class NominalMotion:
         config, arms = self.config, state.reference[:, ARMS]
         if config.kind == "default":
             return torch.cat([self.default[LOWER_JOINTS].expand(len(arms), -1), arms], dim=1), state
+        state = self._sense(state, projected_gravity, base_angular_velocity)
         stance = self.pose.lookup(state.reference[:, POSTURE])
         attitude = self._attitude(state.reference, stance.position, joint_position)
         if config.carry_arms or config.bear_arms:
@@ -264,9 +282,19 @@ class NominalMotion:
             state = self._trim_velocity(state, torch.cat([velocity[:, :2], yaw_rate], dim=1))
             targets = torch.addmm(targets, self._march(state), self._march_joints)
         if config.balance_stiffness > 0.0:
-            balance, state = self._balance(state, attitude, projected_gravity, base_angular_velocity)
+            balance, state = self._balance(state, attitude)
             targets = torch.addmm(targets, balance, self._balance_joints)
         return targets, state
+
+    def _sense(self, state: NominalState, gravity: Tensor, angular_velocity: Tensor) -> NominalState:
+        """Filter the measured gravity direction (complementary, with the gyroscope) and tilt rate."""
+        config = self.config
+        carried = state.gravity - self.control_period * torch.linalg.cross(angular_velocity, state.gravity)
+        taken_in = carried + config.gravity_gain * (gravity - carried)
+        is_first = (state.gravity == 0.0).all(dim=1, keepdim=True)
+        filtered = torch.where(is_first, gravity, taken_in / taken_in.norm(dim=1, keepdim=True).clamp_min(1e-6))
+        rate = state.tilt_rate + config.rate_gain * (angular_velocity[:, :2] - state.tilt_rate)
+        return state._replace(gravity=filtered, tilt_rate=rate)
 
     def _attitude(self, reference: Tensor, position: Tensor, measured: Tensor) -> _Attitude:
         angles = torch.cat([reference[:, TORSO], position[:, WAIST_JOINTS], measured[:, WAIST_JOINTS]], dim=1)
@@ -333,9 +361,7 @@ class NominalMotion:
         parts = (config.knee_lift * raised, config.lateral_shift * sine[:, None], stride, twist[:, None])
         return torch.cat(parts, dim=1)
 
-    def _balance(
-        self, state: NominalState, attitude: _Attitude, gravity: Tensor, angular_velocity: Tensor
-    ) -> tuple[Tensor, NominalState]:
+    def _balance(self, state: NominalState, attitude: _Attitude) -> tuple[Tensor, NominalState]:
         """How much of each row of ``_BALANCE`` there is (N, 8) [rad], and the state of the feedback.
 
         Ankles and, marching, steps lean against the pelvis' tilt off its nominal attitude. The capture point of a
@@ -347,8 +373,8 @@ class NominalMotion:
         lean = lean.clamp(-config.largest_lean, config.largest_lean) * walking
         upright = -attitude.torso[:, 2]
         wanted = lean + (attitude.waist @ upright[:, :, None])[:, :, 0]
-        tilt = torch.linalg.cross(gravity, wanted)[:, :2]
-        rate = angular_velocity[:, :2]
+        tilt = torch.linalg.cross(state.gravity, wanted)[:, :2]
+        rate = state.tilt_rate
         ankle = config.balance_stiffness * tilt + config.balance_damping * rate
         capture = config.step_stiffness * tilt + config.step_damping * rate
         swing = torch.sin(state.phase + config.capture_lead)[:, None] * walking
@@ -357,7 +383,7 @@ class NominalMotion:
         if config.steady_time > 0.0:
             steady_tilt = steady_tilt + (self.control_period / config.steady_time) * (tilt - steady_tilt)
         unbalance = (tilt - steady_tilt + config.step_damping * rate).norm(dim=1)
-        torso_gravity = (attitude.measured_waist.transpose(1, 2) @ gravity[:, :, None])[:, :, 0]
+        torso_gravity = (attitude.measured_waist.transpose(1, 2) @ state.gravity[:, :, None])[:, :, 0]
         torso_tilt = torch.linalg.cross(torso_gravity, upright)[:, :2]
         trim = state.torso_trim + config.torso_trim_rate * self.control_period * torso_tilt
         trim = trim.clamp(-config.largest_torso_trim, config.largest_torso_trim)

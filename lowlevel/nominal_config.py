@@ -74,6 +74,11 @@ class NominalConfig:
     """Rate at which waist roll and pitch take up a lasting torso error [rad/s per rad]; 0 switches that off."""
     largest_torso_trim: float = 0.2
     """Most that they take up [rad]."""
+    gravity_gain: float = 0.1
+    """Share of the measured gravity direction that the balance takes in at every control step; the gyroscope carries
+    the rest on. 1: it balances on the measurement, whose noise shakes the hips."""
+    rate_gain: float = 0.5
+    """The same for the measured tilt rate, of which the rest is the one of the step before."""
     balance_stiffness: float = 3.2
     """Ankle correction per tilt of the pelvis off its nominal attitude [rad/rad]; 0 switches the strategy off."""
     balance_damping: float = 0.245
