@@ -86,7 +86,7 @@ class NominalConfig:
     step_stiffness: float = 2.05
     """While marching: hip correction per tilt [rad/rad]; the swing foot steps towards the fall, the stance hip
     rights the body."""
-    step_damping: float = 0.2
+    step_damping: float = 0.27
     """Hip correction per tilt rate [rad per rad/s]; 0.27 s is the time constant of a 0.7 m inverted pendulum."""
     lean: tuple[float, float] = (0.09, 0.15)
     """Lean of the pelvis that counts as upright while walking, per commanded vx and vy [rad per m/s]: steps that
@@ -95,7 +95,7 @@ class NominalConfig:
     """Largest lean along x and along y [rad]."""
     steady_time: float = 2.0
     """Time constant of the slow average of the tilt, which is no unbalance [s]; 0: all of it is."""
-    stepping_threshold: float = 0.4
+    stepping_threshold: float = 0.2
     """:attr:`NominalState.unbalance` from which a standing robot marches to catch itself [rad]."""
     stepping_time: float = 0.8
     """How long it then marches [s]."""
