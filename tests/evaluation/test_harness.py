@@ -25,7 +25,7 @@ from lowlevel.commands import HEIGHT, VELOCITY
 from lowlevel.controller import Controller
 from lowlevel.observation import NoiseConfig
 from lowlevel.terrain import TerrainConfig
-from robots.g1.constants import FOOT_BODIES, HAND_BODIES
+from robots.g1.constants import FOOT_BODIES, HAND_BODIES, NUM_JOINTS
 
 FLAT = TerrainConfig(tile_size=16.0)
 QUIET = NoiseConfig(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -197,11 +197,12 @@ def test_steps_are_counted_by_batches(arena: Arena, controller: Controller) -> N
     assert sum(passed) == batch_steps(arena, episodes) == 10
 
 
-def test_a_controller_with_other_gains_is_refused(untrained_controller: Path) -> None:
+def test_the_robot_has_the_controllers_gains(untrained_controller: Path) -> None:
     controller = Controller.load(untrained_controller)
     controller.gains = replace(controller.gains, stiffness=2.0 * controller.gains.stiffness)
-    with pytest.raises(ValueError, match="none of the sets that can be simulated"):
-        Arena(controller, FLAT)
+    model = Arena(controller, FLAT, batch=1).simulation.model
+    np.testing.assert_allclose(model.actuator_gainprm[:NUM_JOINTS, 0], controller.gains.stiffness)
+    np.testing.assert_allclose(model.actuator_biasprm[:NUM_JOINTS, 2], -controller.gains.damping)
 
 
 def test_seeds_of_different_episodes_differ() -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from lowlevel.control_step import Memory
+from lowlevel.control_step import MEMORY_NAMES, Memory
 from lowlevel.controller import (
     CONFIG_FILE,
     GOLDEN_FILE,
@@ -66,7 +66,8 @@ def test_onnx_file_needs_nothing_of_this_package(folder: Path) -> None:
     session = onnxruntime.InferenceSession(folder / ONNX_FILE)
     steps = golden_steps(folder)
     space = Controller.load(folder).config.command_space
-    memory = {name: value.numpy() for name, value in Memory.fresh(4, space)._asdict().items()}
+    fresh = Memory.fresh(4, space).tensors
+    memory = {name: value.numpy() for name, value in zip(MEMORY_NAMES, fresh, strict=True)}
     for step in steps:
         measured = {name: value.numpy() for name, value in step.items() if name in INPUTS and name not in memory}
         outputs = dict(zip(OUTPUTS, session.run(OUTPUTS, measured | memory), strict=True))

@@ -136,7 +136,7 @@ def test_falls_terminate_and_time_limits_truncate() -> None:
     assert (environment.buffers.episode_step == 0).all()
     toppled = PilotEnvironment(QUIET)
     toppled.reset()
-    everything = [toppled.step(torch.full((6, 29), 4.0)) for _ in range(60)]
+    everything = [toppled.step(torch.full((6, 29), 8.0)) for _ in range(60)]
     assert torch.stack([result.terminated for result in everything]).any(dim=0).all()
 
 
