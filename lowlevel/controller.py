@@ -41,7 +41,7 @@ from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
     "controller.json",
     "weights.safetensors",

@@ -50,8 +50,8 @@ _MARCH: tuple[dict[str, float], ...] = (
     {"left_hip_pitch": 1.0, "right_hip_pitch": -1.0, "left_ankle_pitch": -1.0, "right_ankle_pitch": 1.0},
     {"left_hip_roll": -1.0, "right_hip_roll": 1.0, "left_ankle_roll": 1.0, "right_ankle_roll": -1.0},
     {"left_hip_yaw": -1.0, "right_hip_yaw": 1.0},
-    # Turn of the pelvis over both feet.
-    {"left_hip_yaw": 1.0, "right_hip_yaw": 1.0},
+    # Turn of the torso against the pelvis.
+    {"waist_yaw": 1.0},
 )
 _BALANCE: tuple[dict[str, float], ...] = (
     # Ankle strategy in roll and pitch.
@@ -109,6 +109,11 @@ class NominalState(NamedTuple):
     """Filtered angular velocity about x and y in the pelvis frame (N, 2) [rad/s]."""
     steady_tilt: Tensor
     """Slow average of the tilt about x and y (N, 2) [rad]."""
+    acceleration: Tensor
+    """Filtered acceleration of the velocity reference (N, 2), with that of turning [m/s^2]."""
+    swing_trim: Tensor
+    """Turn of the waist against the yaw rate in time with the gait: cosine and sine parts of its first three harmonics
+    (N, 6) [rad]."""
     velocity_trim: Tensor
     """What the march adds to the velocity reference against a lasting error (N, 3) [m/s, m/s, rad/s]."""
     torso_trim: Tensor
@@ -132,6 +137,8 @@ class NominalState(NamedTuple):
             gravity=zeros(3),
             tilt_rate=zeros(2),
             steady_tilt=zeros(2),
+            acceleration=zeros(2),
+            swing_trim=zeros(6),
             velocity_trim=zeros(3),
             torso_trim=zeros(2),
         )
@@ -172,15 +179,17 @@ class NominalMotion:
         self._inverse_arm_stiffness = 1.0 / arm_stiffness
         rate = torch.full((COMMAND_SIZE,), math.inf, device=device)
         rate[VELOCITY], rate[HEIGHT] = config.velocity_rate, config.height_rate
-        rate[TORSO], rate[ARMS] = config.torso_rate, config.arm_rate
+        rate[TORSO], rate[ARMS] = torch.tensor(config.torso_rate, device=device), config.arm_rate
         self.arm_mass = ArmMass(device)
         self._default_moment = self.arm_mass.first_moment(self.default[None, ARM_JOINTS])
         axes = _TORSO_AXES + _WAIST_AXES + _WAIST_AXES
         self._turn_basis = torch.tensor(turn_basis(axes), dtype=torch.float32, device=device)
         self._stepping_torso = torch.tensor(config.stepping_torso, device=device)
         self._stride = torch.tensor(config.stride, device=device)
+        self._harmonics = torch.arange(1.0, 4.0, device=device)
+        self._swing_lead = torch.tensor(config.swing_trim_lead, device=device)
         self._creep = torch.tensor([config.creep, 0.0, 0.0], device=device)
-        self._lean = torch.tensor([*config.lean, 0.0], device=device)
+        self._lean = torch.tensor(config.lean, device=device)
         self._march_joints = _joints_moved(_MARCH, device)
         self._balance_joints = _joints_moved(_BALANCE, device)
         self._bearing_joints = _joints_moved(_BEARING, device)[:, LOWER_JOINTS]
@@ -212,6 +221,10 @@ class NominalMotion:
         goal = torch.cat([command[:, VELOCITY], self._posture(state, command), command[:, ARMS]], dim=1)
         change = (goal - state.reference).clamp(-self._largest_change, self._largest_change)
         reference = state.reference + change
+        # A robot that turns accelerates towards the inside of the curve.
+        vx, vy, yaw_rate = reference[:, VELOCITY].unbind(1)
+        acceleration = change[:, :2] / period + torch.stack([-yaw_rate * vy, yaw_rate * vx], dim=1)
+        share = period / (period + config.acceleration_time)
         # A march sways by as much, so only one that fades out starts anew; so does a move to another posture.
         loses_balance = (state.unbalance > config.stepping_threshold) & (state.walking <= 0.5)
         rests = (reference[:, POSTURE] == goal[:, POSTURE]).all(dim=1)
@@ -230,7 +243,13 @@ class NominalMotion:
         phase = torch.where(moves, (state.phase + step) % (2.0 * math.pi), torch.zeros_like(state.phase))
         settling = torch.where(moves, config.settling_time, (state.settling - period).clamp_min(0.0))
         return state._replace(
-            reference=reference, phase=phase, walking=walking, stopping=stopping, stepping=stepping, settling=settling
+            reference=reference,
+            acceleration=torch.lerp(state.acceleration, acceleration, share),
+            phase=phase,
+            walking=walking,
+            stopping=stopping,
+            stepping=stepping,
+            settling=settling,
         )
 
     def clock(self, state: NominalState) -> Tensor:
@@ -280,6 +299,7 @@ class NominalMotion:
         if config.kind == "march":
             yaw_rate = -(base_angular_velocity * projected_gravity).sum(dim=1, keepdim=True)
             state = self._trim_velocity(state, torch.cat([velocity[:, :2], yaw_rate], dim=1))
+            state = self._trim_swing(state, yaw_rate)
             targets = torch.addmm(targets, self._march(state), self._march_joints)
         if config.balance_stiffness > 0.0:
             balance, state = self._balance(state, attitude)
@@ -335,6 +355,23 @@ class NominalMotion:
         bound = constant + share * wanted.norm(dim=1, keepdim=True)
         return state._replace(velocity_trim=trim.clamp(-bound, bound) * state.walking[:, None])
 
+    def _trim_swing(self, state: NominalState, yaw_rate: Tensor) -> NominalState:
+        """Integrate the error of ``yaw_rate`` (N, 1) in time with the gait while the robot marches.
+
+        What repeats with the gait, at any speed and posture, is taken back by a turn that repeats with it, as a
+        disturbance of known frequency is cancelled by adaptive feed-forward (Bodson, Sacks and Khosla, IEEE TAC 1994).
+        """
+        config = self.config
+        error = (yaw_rate - state.reference[:, 2:3]) * state.walking[:, None]
+        waves = self._waves(state.phase, self._swing_lead)
+        trim = state.swing_trim + config.swing_trim_rate * self.control_period * error * waves
+        return state._replace(swing_trim=trim.clamp(-config.largest_swing_trim, config.largest_swing_trim))
+
+    def _waves(self, phase: Tensor, lead: Tensor | float = 0.0) -> Tensor:
+        """Cosines and sines (N, 6) of the harmonics of ``phase`` (N,), each ``lead`` (3,) ahead [rad]."""
+        angles = phase[:, None] * self._harmonics + lead
+        return torch.cat([torch.cos(angles), torch.sin(angles)], dim=1)
+
     def _effort(self, state: NominalState) -> Tensor:
         """Velocity (N, 3) that the march is to be made for, so that the reference's comes out."""
         return state.reference[:, VELOCITY] + state.velocity_trim - self._creep
@@ -342,7 +379,7 @@ class NominalMotion:
     def _march(self, state: NominalState) -> Tensor:
         """How much of each row of ``_MARCH`` there is (N, 7) [rad]."""
         config = self.config
-        sine, cosine = torch.sin(state.phase) * state.walking, torch.cos(state.phase) * state.walking
+        sine = torch.sin(state.phase) * state.walking
         lift = torch.sin(state.phase + config.lift_lead) * state.walking
         raised = torch.stack([lift, -lift], dim=1).clamp_min(0.0)
         if config.soft_landing:
@@ -351,14 +388,8 @@ class NominalMotion:
         velocity = torch.stack([vx, vy, yaw_rate + config.side_step_turn * vy], dim=1)
         swing = torch.cos(state.phase + config.stride_lead) * state.walking
         stride = swing[:, None] * velocity * self._stride
-        sine_part, cosine_part, sine_slope, cosine_slope = config.twist
-        forwards = vx.clamp_min(0.0)
-        twist = (sine_part + sine_slope * forwards) * sine + (cosine_part + cosine_slope * forwards) * cosine
-        turning_sine, turning_cosine = config.turning_twist
-        double_phase = 2.0 * state.phase
-        jerk = turning_sine * torch.sin(double_phase) + turning_cosine * torch.cos(double_phase)
-        twist = twist + state.walking * yaw_rate * jerk
-        parts = (config.knee_lift * raised, config.lateral_shift * sine[:, None], stride, twist[:, None])
+        swing_trim = (state.swing_trim * self._waves(state.phase)).sum(dim=1) * state.walking
+        parts = (config.knee_lift * raised, config.lateral_shift * sine[:, None], stride, swing_trim[:, None])
         return torch.cat(parts, dim=1)
 
     def _balance(self, state: NominalState, attitude: _Attitude) -> tuple[Tensor, NominalState]:
@@ -366,13 +397,13 @@ class NominalMotion:
 
         Ankles and, marching, steps lean against the pelvis' tilt off its nominal attitude. The capture point of a
         falling pendulum lies in the direction of tilt + rate * sqrt(height / g) (Pratt et al., Humanoids 2006), so
-        the swing hip moves the foot that way.
+        the swing hip moves the foot that way. A pendulum that accelerates at a leans by a / g.
         """
         config, walking = self.config, state.walking[:, None]
-        lean = self._effort(state) * self._lean
+        lean = self._effort(state)[:, :2] * self._lean + config.acceleration_lean / GRAVITY * state.acceleration
         lean = lean.clamp(-config.largest_lean, config.largest_lean) * walking
         upright = -attitude.torso[:, 2]
-        wanted = lean + (attitude.waist @ upright[:, :, None])[:, :, 0]
+        wanted = torch.nn.functional.pad(lean, (0, 1)) + (attitude.waist @ upright[:, :, None])[:, :, 0]
         tilt = torch.linalg.cross(state.gravity, wanted)[:, :2]
         rate = state.tilt_rate
         ankle = config.balance_stiffness * tilt + config.balance_damping * rate
@@ -387,5 +418,5 @@ class NominalMotion:
         torso_tilt = torch.linalg.cross(torso_gravity, upright)[:, :2]
         trim = state.torso_trim + config.torso_trim_rate * self.control_period * torso_tilt
         trim = trim.clamp(-config.largest_torso_trim, config.largest_torso_trim)
-        balance = torch.cat([ankle, swing * capture, lean[:, :2], trim], dim=1)
+        balance = torch.cat([ankle, swing * capture, lean, trim], dim=1)
         return balance, state._replace(unbalance=unbalance, steady_tilt=steady_tilt, torso_trim=trim)

@@ -164,14 +164,14 @@ class Trainer:
         mean_terms = terms.take()
         share = falls.take()["share"]
         self.fall_rate += 0.1 * (share - self.fall_rate) if self.ppo.updates > 1 else share - 1.0
-        survived_steps = min(1.0 / max(self.fall_rate, 1e-9), float(self.environment.max_steps))
-        self.curriculum.update(mean_terms, survived_steps / self.environment.max_steps)
+        steps_between_falls = 1.0 / max(self.fall_rate, 1e-9)
+        self.curriculum.update(mean_terms, min(steps_between_falls / self.environment.max_steps, 1.0))
         self.environment.open_range = self.curriculum.open_range
         figures = {f"reward/{name}": value for name, value in mean_terms.items()}
         figures |= {f"tracking/{name}": value for name, value in tracking.take().items()}
         figures |= {f"curriculum/{name}": value for name, value in asdict(self.curriculum.open_range).items()}
         figures |= {f"learner/{name}": value for name, value in losses.items()}
-        figures["episode/steps_between_falls"] = survived_steps
+        figures["episode/steps_between_falls"] = steps_between_falls
         figures["speed/collection_seconds"] = collection_seconds
         return figures
 

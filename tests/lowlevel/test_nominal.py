@@ -66,7 +66,7 @@ def test_references_slew_at_their_rates_and_arrive(space: CommandSpace) -> None:
 
 
 def test_clock_runs_while_walking_and_rests_while_standing(space: CommandSpace) -> None:
-    nominal = motion(stopping_time=0.0)
+    nominal = motion(gait_frequency=2.0, velocity_rate=1.0, stopping_time=0.0)
     stand, walk = space.neutral()[None], space.neutral()[None].clone()
     walk[:, VELOCITY.start] = 0.5
     state = NominalState.standing(stand)
@@ -159,7 +159,8 @@ def test_the_march_outlasts_a_stop(space: CommandSpace) -> None:
             steps += 1
         return steps * 0.02
 
-    longer = time_to_rest(motion(stopping_time=1.8)) - time_to_rest(motion(stopping_time=0.0))
+    outlasting, plain = motion(velocity_rate=1.0, stopping_time=1.8), motion(velocity_rate=1.0, stopping_time=0.0)
+    longer = time_to_rest(outlasting) - time_to_rest(plain)
     assert longer == pytest.approx(0.8 * (0.5 - STANDING_SPEED), abs=0.05)
 
 
@@ -210,6 +211,73 @@ def test_the_march_takes_up_a_lasting_velocity_error_within_bounds(space: Comman
     assert state.velocity_trim[0, 0].item() == pytest.approx(0.05 + 0.4 * 0.6)
     standing = nominal.joint_targets(state._replace(walking=torch.zeros(1)), DEFAULT, UPRIGHT, STILL, STILL)[1]
     assert not standing.velocity_trim.any()
+
+
+def test_the_waist_learns_to_take_back_what_repeats_with_the_gait(space: CommandSpace) -> None:
+    """A pelvis whose yaw rate is a disturbance in time with the gait plus five times the waist's last turn."""
+    command = space.neutral()[None].clone()
+    command[:, VELOCITY] = torch.tensor([0.4, 0.0, 0.2])
+    waist = joint_index("waist_yaw_joint")
+
+    def remaining(largest: float) -> tuple[float, float]:
+        nominal = motion(swing_trim_lead=(math.pi,) * 3, largest_swing_trim=largest)
+        still = motion(swing_trim_rate=0.0)
+        state, turn, errors, turns = NominalState.standing(command), 0.0, [], []
+        for _ in range(1000):
+            state = nominal.advance(state, command)
+            phase = state.phase.item()
+            error = 0.3 * math.cos(phase) - 0.2 * math.sin(2.0 * phase) + 0.1 * math.sin(3.0 * phase) + 5.0 * turn
+            turning = torch.tensor([[0.0, 0.0, 0.2 + error]])
+            forgetful = state._replace(swing_trim=torch.zeros(1, 6))
+            untrimmed = still.joint_targets(forgetful, DEFAULT, UPRIGHT, turning, STILL)[0]
+            targets, state = nominal.joint_targets(state, DEFAULT, UPRIGHT, turning, STILL)
+            turn = (targets - untrimmed)[0, waist].item()
+            errors.append(abs(error))
+            turns.append(abs(turn))
+        return max(errors[-50:]), max(turns)
+
+    error, turn = remaining(largest=0.15)
+    assert error < 0.1
+    assert turn < 0.15
+    error, turn = remaining(largest=0.01)
+    assert error > 0.3
+    assert turn < 6 * 0.01
+
+
+def test_the_lean_is_that_of_a_pendulum_on_the_reference_path(space: CommandSpace) -> None:
+    """The acceleration that the march leans into is the path's second derivative, by finite differences."""
+    nominal = motion(acceleration_time=0.0, velocity_rate=1.0)
+    command, start = space.neutral()[None].clone(), space.neutral()[None]
+    command[:, VELOCITY] = torch.tensor([0.8, -0.3, 0.5])
+    state, heading, velocities, accelerations = NominalState.standing(start), 0.0, [], []
+    for _ in range(80):
+        state = nominal.advance(state, command)
+        vx, vy, yaw_rate = state.reference[0, VELOCITY].tolist()
+        heading += 0.02 * yaw_rate
+        to_world = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
+        velocities.append(to_world @ [vx, vy])
+        accelerations.append(to_world @ state.acceleration[0].double().numpy())
+    path = np.diff(velocities, axis=0) / 0.02
+    assert np.abs(path[10]).max() > 0.9  # starts
+    assert np.linalg.norm(path[-1]) == pytest.approx(0.5 * math.hypot(0.8, 0.3), rel=0.02)  # turns
+    assert np.allclose(path, np.array(accelerations)[1:], atol=0.05)
+
+
+def test_a_robot_that_leans_into_a_turn_is_in_balance(space: CommandSpace) -> None:
+    command = space.neutral()[None].clone()
+    command[:, VELOCITY] = torch.tensor([1.0, 0.0, 0.6])
+    ankle = joint_index("left_ankle_roll_joint")
+    state = NominalState.standing(command)._replace(walking=torch.ones(1), acceleration=torch.tensor([[0.0, 0.6]]))
+    # A pelvis that leans to the left sees gravity point to its left.
+    angle = -0.6 / 9.81
+    leaning = torch.tensor([[0.0, -math.sin(angle), -math.cos(angle)]])
+    quiet = {"lean": (0.0, 0.0), "step_stiffness": 0.0, "step_damping": 0.0, "velocity_trim_rate": 0.0, "creep": 0.0}
+    turning, upright = motion(**quiet), motion(acceleration_lean=0.0, **quiet)
+    balanced = upright.joint_targets(state, DEFAULT, UPRIGHT, STILL, STILL)[0][0, ankle].item()
+    leans = turning.joint_targets(state._replace(gravity=leaning), DEFAULT, leaning, STILL, STILL)[0][0, ankle].item()
+    stands = turning.joint_targets(state, DEFAULT, UPRIGHT, STILL, STILL)[0][0, ankle].item()
+    assert leans == pytest.approx(balanced, abs=2e-3)
+    assert abs(stands - balanced) > 0.1
 
 
 def test_a_robot_in_a_deep_squat_does_not_march(space: CommandSpace) -> None:
