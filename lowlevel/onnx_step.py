@@ -52,7 +52,7 @@ def export_step(step: ControlStep, space: CommandSpace, path: Path) -> None:
     inputs = (*measured, space.neutral().repeat(count, 1), torch.ones(count, 1), *Memory.fresh(count, space).tensors)
     rows = torch.export.Dim("robots")
     program = torch.onnx.export(
-        _Flat(step),
+        _Flat(step).eval(),
         inputs,
         dynamo=True,
         verbose=False,

@@ -96,8 +96,8 @@ class Terrain:
         ]
         self.tile_centers = torch.tensor(centers, dtype=torch.float32, device=device)
         self._origin = torch.tensor([-size / 2, -size * len(config.tiles) / 2], device=device)
-        # The last row and column stand for the plane around the tiles, which the indices -1 reach as well.
-        self._raster = torch.from_numpy(np.pad(self._rasterise(), (0, 1))).to(device)
+        # The outermost cells stand for the plane around the tiles.
+        self._raster = torch.from_numpy(np.pad(self._rasterise(), 1)).to(device)
         offsets = (torch.arange(MAP_CELLS, device=device) - MAP_CELLS // 2) * MAP_RESOLUTION
         self._map_offsets = torch.stack(torch.meshgrid(offsets, offsets, indexing="ij"), -1).reshape(MAP_SIZE, 2)
 
@@ -132,9 +132,12 @@ class Terrain:
         """Ground height [m] (...,) at world positions ``points`` (..., 2); zero outside the tiles."""
         if not self.blocks:
             return torch.zeros(points.shape[:-1], device=points.device)
-        cells = torch.floor((points - self._origin) / self.config.raster_resolution).long()
+        # One axis at a time: for the elevation maps twice as fast as both in one tensor.
         rows, columns = self._raster.shape
-        return self._raster[cells[..., 0].clamp(-1, rows - 1), cells[..., 1].clamp(-1, columns - 1)]
+        (x, y), (x0, y0), resolution = points.unbind(-1), self._origin.unbind(), self.config.raster_resolution
+        row = ((x - x0) / resolution + 1.0).clamp(0, rows - 1).int()
+        column = ((y - y0) / resolution + 1.0).clamp(0, columns - 1).int()
+        return torch.index_select(self._raster.flatten(), 0, (row * columns + column).flatten()).view(row.shape)
 
     def highest(self, center: Tensor, reach: float) -> Tensor:
         """Highest ground [m] (N,) within ``reach`` [m] of ``center`` (N, 2) along both axes."""
