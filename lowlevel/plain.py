@@ -3,25 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import fields, is_dataclass
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+_ACCEPTED: dict[type, tuple[type, ...]] = {bool: (bool,), int: (int,), float: (int, float), str: (str,)}
+"""What JSON may hold for a field of each plain type; True and False are numbers to Python, but not here."""
 
 
-def from_plain(kind: type, value: Any) -> Any:
+def from_plain(kind: type, value: Any, name: str = "the configuration") -> Any:
     """Rebuild nested dataclasses and tuples from what ``dataclasses.asdict`` and JSON made of them.
+
+    ``name`` is what messages call ``value``.
 
     Raises:
         KeyError: naming a field that is unknown, or absent: today's default may not be what it was then.
+        TypeError: naming a field whose value is of another type than the field.
+        ValueError: naming a field whose value is none of its choices.
     """
     if is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise TypeError(f"{name} must hold the fields of {kind.__name__}, not {value!r}")
         hints = get_type_hints(kind)
         names = {f.name for f in fields(kind)}
-        for name in sorted(set(value) - names):
-            raise KeyError(f"{kind.__name__} has no field {name!r}")
-        for name in sorted(names - set(value)):
-            raise KeyError(f"{kind.__name__} lacks its field {name!r}")
-        return kind(**{name: from_plain(hints[name], item) for name, item in value.items()})
+        for unknown in sorted(set(value) - names):
+            raise KeyError(f"{kind.__name__} has no field {unknown!r}")
+        for absent in sorted(names - set(value)):
+            raise KeyError(f"{kind.__name__} lacks its field {absent!r}")
+        return kind(**{field: from_plain(hints[field], item, field) for field, item in value.items()})
     if get_origin(kind) is tuple:
         inner = get_args(kind)
+        if not isinstance(value, (list, tuple)):
+            raise TypeError(f"{name} must be a list, not {value!r}")
         kinds = [inner[0]] * len(value) if len(inner) == 2 and inner[1] is Ellipsis else inner
-        return tuple(from_plain(k, item) for k, item in zip(kinds, value, strict=True))
+        if len(kinds) != len(value):
+            raise TypeError(f"{name} must have {len(kinds)} entries, not {len(value)}")
+        return tuple(from_plain(k, item, name) for k, item in zip(kinds, value, strict=True))
+    if get_origin(kind) is Literal and value not in get_args(kind):
+        raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, not {value!r}")
+    if kind in _ACCEPTED and (not isinstance(value, _ACCEPTED[kind]) or isinstance(value, bool) is not (kind is bool)):
+        raise TypeError(f"{name} must be of type {kind.__name__}, not {value!r}")
     return value

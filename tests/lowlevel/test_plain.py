@@ -32,6 +32,28 @@ def test_unknown_and_absent_fields_are_refused(change, message: str) -> None:
         from_plain(TrainingConfig, plain)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("stepping_time", "long", "stepping_time must be of type float, not 'long'"),
+        ("stepping_time", True, "stepping_time must be of type float, not True"),
+        ("gait_clock", 1, "gait_clock must be of type bool, not 1"),
+        ("torso_rate", 1.0, r"torso_rate must be a list, not 1\.0"),
+        ("lean", [0.1], "lean must have 2 entries, not 1"),
+        ("lean", [0.1, None], "lean must be of type float, not None"),
+        ("kind", "gallop", "kind must be one of default, pose, march, not 'gallop'"),
+    ],
+)
+def test_values_of_another_type_are_refused(field: str, value: object, message: str) -> None:
+    plain = asdict(TrainingConfig())
+    plain["environment"]["nominal"][field] = value
+    with pytest.raises((TypeError, ValueError), match=message):
+        from_plain(TrainingConfig, plain)
+    plain["environment"] = 3
+    with pytest.raises(TypeError, match="environment must hold the fields of EnvironmentConfig, not 3"):
+        from_plain(TrainingConfig, plain)
+
+
 def test_the_shipped_learning_state_is_of_this_version() -> None:
     run = Path(__file__).resolve().parents[2] / "checkpoints" / "training" / "pilot-g1-simple"
     assert read_training_config(run).environment.terrain.tiles == ("flat", "irregular")
