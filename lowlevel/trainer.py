@@ -164,7 +164,8 @@ class Trainer:
         mean_terms = terms.take()
         share = falls.take()["share"]
         self.fall_rate += 0.1 * (share - self.fall_rate) if self.ppo.updates > 1 else share - 1.0
-        steps_between_falls = 1.0 / max(self.fall_rate, 1e-9)
+        # No more than were taken: a run that has not fallen yet does not stand for ever.
+        steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
         self.curriculum.update(mean_terms, min(steps_between_falls / self.environment.max_steps, 1.0))
         self.environment.open_range = self.curriculum.open_range
         figures = {f"reward/{name}": value for name, value in mean_terms.items()}
