@@ -68,6 +68,10 @@ class PPOConfig:
     """Weight of the entropy bonus [1/nat]."""
     initial_std: float = 0.2
     """First standard deviation of the exploration noise [action units]."""
+    final_std: float = 0.07
+    """Standard deviation that the noise may have at most at the end of a run [action units]; the bound falls to it from
+    ``initial_std`` by the same factor in every step. The less noise, the nearer is what the policy is paid for to what
+    it does without."""
     std_bounds: tuple[float, float] = (0.05, 1.0)
     """Range of the exploration noise [action units]."""
     noise_correlation: float = 0.0
@@ -102,6 +106,8 @@ class PPOConfig:
             raise ValueError(f"noise_correlation {self.noise_correlation} is not at least 0 and below 1")
         if not 0 < low <= self.initial_std <= high:
             raise ValueError(f"initial_std {self.initial_std} is outside std_bounds {self.std_bounds}")
+        if not 0 < self.final_std <= self.initial_std:
+            raise ValueError(f"final_std {self.final_std} is not above 0 and at most initial_std {self.initial_std}")
 
 
 def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, clip: float) -> Tensor:
@@ -266,12 +272,15 @@ class Learner:
         self.optimizers["actor"].param_groups[0]["lr"] = rate
         for name in groups:
             self.optimizers[name].step()
-        low, high = self.config.std_bounds
-        with torch.no_grad():
-            self.actor.log_std.clamp_(math.log(low), math.log(high))
+        self.limit_noise(*self.config.std_bounds)
         if "estimator" in groups:
             self.target_encoder.renormalise_prototypes()
         return {**result, "learning_rate": rate}
+
+    @torch.no_grad()
+    def limit_noise(self, lowest: float, highest: float) -> None:
+        """Move the standard deviations of the exploration noise into these bounds [action units]."""
+        self.actor.log_std.clamp_(math.log(lowest), math.log(highest))
 
     def state_dict(self) -> dict[str, Any]:
         """Networks and optimisers."""

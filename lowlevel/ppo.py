@@ -131,6 +131,12 @@ class PPO:
         self._noise = fresh if self._noise is None else kept * self._noise + math.sqrt(1.0 - kept * kept) * fresh
         return self._noise
 
+    def calm(self, share: float) -> None:
+        """Lower the exploration noise to what it may be after ``share`` of the run, in [0, 1]."""
+        config, lowest = self.config, self.config.std_bounds[0]
+        highest = config.initial_std * (config.final_std / config.initial_std) ** share
+        self.learner.limit_noise(lowest, max(lowest, highest))
+
     @torch.no_grad()
     def deterministic(self, observation: Mapping[str, Tensor]) -> Tensor:
         """Mean actions (N, A), without noise; nothing is stored but :attr:`estimated_velocity`."""

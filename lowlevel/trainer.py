@@ -148,6 +148,7 @@ class Trainer:
     def iterate(self) -> dict[str, float]:
         """One rollout and one update; returns figures to log."""
         terms, tracking, falls = Averages(), Averages(), Averages()
+        self.ppo.calm(min(self.steps / self.config.total_steps, 1.0))
         started = time.monotonic()
         for _ in range(self.config.ppo.steps_per_update):
             action = self.ppo.act(self.observation)

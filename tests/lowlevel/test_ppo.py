@@ -213,6 +213,23 @@ def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
     assert float(deviations.min()) > 0.2999 and float(deviations.max()) < 0.4001
 
 
+@pytest.mark.parametrize(("share", "expected"), [(0.0, 0.2), (0.5, 0.1), (1.0, 0.05)])
+def test_exploration_noise_calms_down_over_a_run(share: float, expected: float) -> None:
+    ppo = make_ppo(initial_std=0.2, final_std=0.05, std_bounds=(0.04, 1.0))
+    ppo.calm(share)
+    torch.testing.assert_close(ppo.actor.log_std.exp(), torch.full((4,), expected))
+
+
+def test_noise_that_is_low_already_stays_and_is_not_calmed_below_its_bounds() -> None:
+    ppo = make_ppo(initial_std=0.2, final_std=0.01, std_bounds=(0.05, 1.0))
+    with torch.no_grad():
+        ppo.actor.log_std.fill_(math.log(0.06))
+    ppo.calm(0.0)
+    torch.testing.assert_close(ppo.actor.log_std.exp(), torch.full((4,), 0.06))
+    ppo.calm(1.0)
+    torch.testing.assert_close(ppo.actor.log_std.exp(), torch.full((4,), 0.05))
+
+
 def test_exploration_noise_is_correlated_as_stated() -> None:
     """And a restored state goes on with the same noise."""
     ppo = make_ppo(4096, noise_correlation=0.8, steps_per_update=12, minibatches=1)
@@ -256,6 +273,8 @@ def test_bad_settings_are_refused() -> None:
         PPOConfig(symmetry="both")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="outside std_bounds"):
         PPOConfig(initial_std=2.0)
+    with pytest.raises(ValueError, match="at most initial_std"):
+        PPOConfig(initial_std=0.2, final_std=0.3)
     with pytest.raises(ValueError, match="estimator_epochs 9"):
         PPOConfig(estimator_epochs=9)
     with pytest.raises(ValueError, match="do not split into 5 minibatches"):
