@@ -1,7 +1,10 @@
 """The Unitree G1 (29 DoF, rev 1.0) as data: joints, motors, gains and frames.
 
 Joint order is Unitree's and is stated once, in :data:`JOINTS`; everything else is indexed by name.
-Position limits and effort limits are read from the URDF by :mod:`robots.g1.model`.
+Position limits are read from the URDF by :mod:`robots.g1.model`.
+
+Efforts are the URDF's but for the joints that two 5020 motors of 25 N m drive in parallel, ankles and waist roll and
+pitch: 50 N m, as in Unitree's MJCF of the same revision, in mjlab, HOMIE and FALCON; the URDF says 35.
 
 Sources: rotor inertias and the armature gain rule are those published with mjlab
 (``asset_zoo/robots/unitree_g1/g1_constants.py``) and BeyondMimic; waist and ankle gains of the stiff set
@@ -21,13 +24,17 @@ import numpy as np
 
 
 class Motor(Enum):
-    """Actuator type; the value is the reflected rotor inertia (armature) [kg m^2]."""
+    """Actuator type; the value is the reflected rotor inertia (armature) [kg m^2] and the largest torque [N m]."""
 
-    GEAR_7520_14 = 0.01018
-    GEAR_7520_22 = 0.02510
-    DUAL_5020 = 0.00722
-    SINGLE_5020 = 0.00361
-    SINGLE_4010 = 0.00425
+    GEAR_7520_14 = (0.01018, 88.0)
+    GEAR_7520_22 = (0.02510, 139.0)
+    DUAL_5020 = (0.00722, 50.0)
+    SINGLE_5020 = (0.00361, 25.0)
+    SINGLE_4010 = (0.00425, 5.0)
+
+    def __init__(self, armature: float, effort: float) -> None:
+        self.armature = armature
+        self.effort = effort
 
 
 @dataclass(frozen=True)
@@ -81,8 +88,10 @@ ARM_JOINTS = slice(15, 29)
 
 DEFAULT_POSITION = np.array([joint.default for joint in JOINTS])
 """Default joint positions (29,) [rad]; knees and elbows slightly bent, arms at the sides."""
-ARMATURE = np.array([joint.motor.value for joint in JOINTS])
+ARMATURE = np.array([joint.motor.armature for joint in JOINTS])
 """Reflected rotor inertia (29,) [kg m^2]."""
+EFFORT = np.array([joint.motor.effort for joint in JOINTS])
+"""Largest torque (29,) [N m]."""
 
 PELVIS_BODY = "pelvis"
 TORSO_BODY = "torso_link"
@@ -134,8 +143,7 @@ def _armature_gains() -> Gains:
     natural_frequency = 2.0 * math.pi * 10.0
     stiffness = ARMATURE * natural_frequency**2
     damping = 2.0 * 2.0 * ARMATURE * natural_frequency
-    effort = _per_joint((88, 139, 88, 139, 35, 35), (88, 35, 35), (25, 25, 25, 25, 25, 5, 5))
-    return Gains(stiffness, damping, 0.25 * effort / stiffness)
+    return Gains(stiffness, damping, 0.25 * EFFORT / stiffness)
 
 
 STIFF_GAINS = Gains(

@@ -1,8 +1,8 @@
 """MuJoCo model of the G1, built from the same URDF that Pinocchio reads.
 
-The URDF gives the kinematic tree, inertias, joint limits and effort limits. Added here: the free joint, rotor
-inertia, position actuators with force limits, foot spheres, box-primitive palms, the self-collision pairs that
-matter, and sensors. Meshes are loaded for pictures only.
+The URDF gives the kinematic tree, inertias and joint limits. Added here: the free joint, rotor inertia, position
+actuators with force limits, foot spheres, box-primitive palms, the self-collision pairs that matter, and sensors.
+Meshes are loaded for pictures only.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from robots.g1.constants import (
     ARMATURE,
+    EFFORT,
     FOOT_BODIES,
     HAND_BODIES,
     JOINT_NAMES,
@@ -123,7 +124,7 @@ def _add_actuators(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     for index, name in enumerate(JOINT_NAMES):
         joint = spec.joint(name)
         joint.armature = ARMATURE[index]
-        effort = float(joint.actfrcrange[1])
+        effort = float(EFFORT[index])
         # The limit belongs to the actuator: MuJoCo 4 no longer damps saturated joint limits implicitly.
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         stiffness, damping = float(gains.stiffness[index]), float(gains.damping[index])

@@ -65,7 +65,11 @@ def test_limits_and_masses_agree(mujoco_model: mujoco.MjModel) -> None:
     model = build_model()
     np.testing.assert_allclose(model.lowerPositionLimit[7:], mujoco_model.jnt_range[1:, 0], atol=1e-9)
     np.testing.assert_allclose(model.upperPositionLimit[7:], mujoco_model.jnt_range[1:, 1], atol=1e-9)
-    np.testing.assert_allclose(model.effortLimit[6:], mujoco_model.actuator_forcerange[:, 1], atol=1e-9)
+    # Two 25 N m motors drive an ankle, and waist roll and pitch; the URDF says 35 N m there.
+    in_pairs = np.array([joint.motor is constants.Motor.DUAL_5020 for joint in constants.JOINTS])
+    np.testing.assert_allclose(model.effortLimit[6:][in_pairs], 35.0)
+    np.testing.assert_allclose(mujoco_model.actuator_forcerange[in_pairs, 1], 2.0 * constants.Motor.SINGLE_5020.effort)
+    np.testing.assert_allclose(model.effortLimit[6:][~in_pairs], mujoco_model.actuator_forcerange[~in_pairs, 1])
     assert mujoco_model.body_mass.sum() == pytest.approx(pin.computeTotalMass(model), abs=1e-9)
 
 
