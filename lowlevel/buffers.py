@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lowlevel.nominal import NominalState
+from lowlevel.nominal_state import NominalState
 from lowlevel.observation import FRAME_SIZE, HISTORY_LENGTH
 from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import NUM_JOINTS

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from lowlevel.commands import CommandSpace
 from lowlevel.networks import PilotActor
-from lowlevel.nominal import NominalMotion, NominalState
+from lowlevel.nominal import NominalMotion
+from lowlevel.nominal_state import NominalState
 from lowlevel.observation import (
     FRAME_SIZE,
     HISTORY_LENGTH,
@@ -39,10 +40,12 @@ class Memory(NamedTuple):
     """Robots that have not acted since their reset (N,) bool: their history starts with the next frame."""
 
     @classmethod
-    def fresh(cls, num_robots: int, space: CommandSpace, device: torch.device | str = "cpu") -> Memory:
-        """The memory of robots that have not acted yet."""
+    def fresh(
+        cls, num_robots: int, space: CommandSpace, settling_time: float, device: torch.device | str = "cpu"
+    ) -> Memory:
+        """The memory of robots that have not acted yet and first stand still for ``settling_time`` [s]."""
         return cls(
-            nominal=NominalState.standing(space.neutral(device).repeat(num_robots, 1)),
+            nominal=NominalState.standing(space.neutral(device).repeat(num_robots, 1), settling_time),
             action=torch.zeros(num_robots, NUM_JOINTS, device=device),
             history=torch.zeros(num_robots, HISTORY_LENGTH + 1, FRAME_SIZE, device=device),
             is_fresh=torch.ones(num_robots, dtype=torch.bool, device=device),

@@ -41,7 +41,7 @@ from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
 
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
 CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
     "controller.json",
     "weights.safetensors",
@@ -125,7 +125,8 @@ class Controller:
 
     def reset(self, num_robots: int, ids: Tensor | None = None) -> None:
         """Forget everything about robots ``ids`` (all ``num_robots`` by default): history, last action, clock."""
-        fresh = Memory.fresh(num_robots, self.config.command_space, self.device)
+        space, settling_time = self.config.command_space, self.config.nominal.settling_time
+        fresh = Memory.fresh(num_robots, space, settling_time, self.device)
         if self._memory is None or ids is None or len(self._memory.action) != num_robots:
             self._memory = fresh
             return

@@ -34,7 +34,7 @@ class CurriculumConfig:
 
     start: CommandRange = field(default_factory=lambda: CommandRange(velocity=0.5, height=0.5, torso=0.5, arms=0.1))
     """Opening of each range at the start; small instead of zero, so that no input is constant."""
-    growth: float = 0.003
+    growth: float = 0.008
     """Largest growth of a factor per update."""
     required_opening: float = 0.6
     """A stage grows only when the stage before it is open at least this far."""

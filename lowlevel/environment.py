@@ -20,8 +20,9 @@ from lowlevel.commands import (
     command_space,
 )
 from lowlevel.measures import Measurement, has_fallen, height_error, torso_error
-from lowlevel.nominal import NominalMotion, NominalState
+from lowlevel.nominal import NominalMotion
 from lowlevel.nominal_config import NominalConfig
+from lowlevel.nominal_state import NominalState
 from lowlevel.observation import (
     PRIVILEGED_SIZE,
     FrameBuilder,
@@ -57,11 +58,11 @@ class EnvironmentConfig:
     """Physics steps per control step; timestep * decimation must be 0.02 s (50 Hz)."""
     gains: str = "stiff"
     """PD gain set, a key of robots.g1.constants.GAINS."""
-    episode_length: float = 20.0
+    episode_length: float = 10.0
     """Longest episode [s]."""
     command_interval: tuple[float, float] = (4.0, 8.0)
     """Time between new commands, uniform [s]."""
-    start_in_posture: float = 0.5
+    start_in_posture: float = 0.25
     """Share of episodes that start in the commanded posture instead of standing upright."""
     action_limit: float = 8.0
     """Actions are clipped to +- this many action scales."""
@@ -264,7 +265,8 @@ class PilotEnvironment:
         neutral = self.sampler.neutral.expand(count, -1)
         reference = torch.where(in_posture, buffers.command[ids], neutral).clone()
         reference[:, VELOCITY] = 0.0
-        for remembered, fresh in zip(buffers.nominal, NominalState.standing(reference), strict=True):
+        standing = NominalState.standing(reference, self.config.nominal.settling_time)
+        for remembered, fresh in zip(buffers.nominal, standing, strict=True):
             remembered[ids] = fresh
 
         heading = self._uniform(-torch.pi, torch.pi, count)

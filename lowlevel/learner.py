@@ -40,11 +40,11 @@ POLICY_KEYS = ("frame", "elevation_map", "flag", "velocity", "latent")
 class PPOConfig:
     """Settings of the learner."""
 
-    steps_per_update: int = 24
+    steps_per_update: int = 48
     """Control steps per robot and update."""
-    epochs: int = 3
+    epochs: int = 4
     """Passes over the rollout per update."""
-    minibatches: int = 4
+    minibatches: int = 8
     """Gradient steps per pass."""
     gamma: float = 0.99
     """Discount per control step."""
@@ -52,7 +52,7 @@ class PPOConfig:
     """Decay of the generalised advantage estimate."""
     clip: float = 0.2
     """Clipping range of the probability ratio."""
-    desired_kl: float = 0.01
+    desired_kl: float = 0.015
     """KL divergence from the acting policy that steers the actor's learning rate [nat]; 0 keeps the rate."""
     actor_learning_rate: float = 3e-4
     """First learning rate of the actor."""
@@ -66,9 +66,9 @@ class PPOConfig:
     """Learning rate of the history encoder, the next-state encoder and the prototypes."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus [1/nat]."""
-    initial_std: float = 0.2
+    initial_std: float = 0.12
     """First standard deviation of the exploration noise [action units]."""
-    final_std: float = 0.07
+    final_std: float = 0.05
     """Standard deviation that the noise may have at most at the end of a run [action units]; the bound falls to it from
     ``initial_std`` by the same factor in every step. The less noise, the nearer is what the policy is paid for to what
     it does without."""

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, POSTURE, STANDING_SPEED, TORSO, VELOCITY, is_walking
 from lowlevel.nominal_config import NominalConfig
+from lowlevel.nominal_state import NominalState
 from lowlevel.rotations import about_axis, conjugate, from_roll_pitch_yaw, multiply
 from robots.g1.arm_mass import ArmMass
 from robots.g1.constants import (
@@ -83,65 +84,6 @@ def _joints_moved(rows: tuple[dict[str, float], ...], device: torch.device | str
         for joint, share in joints.items():
             row[joint_index(f"{joint}_joint")] = share
     return matrix.to(device)
-
-
-class NominalState(NamedTuple):
-    """State of reference filter, gait clock and feedback; one row per robot."""
-
-    reference: Tensor
-    """Slewed command (N, 21)."""
-    phase: Tensor
-    """Gait phase (N,) [rad]; the left foot swings in (0, pi), the right one in (pi, 2 pi)."""
-    walking: Tensor
-    """Fade-in of the march (N,) in [0, 1]."""
-    stopping: Tensor
-    """Time for which a robot marches on after a command to stop (N,) [s]."""
-    stepping: Tensor
-    """Time for which a robot told to stand still marches to catch itself (N,) [s]."""
-    settling: Tensor
-    """Time for which a robot told to stand still keeps its posture (N,) [s]."""
-    unbalance: Tensor
-    """Tilt off the nominal attitude and off its own slow average, plus ``step_damping`` times the tilt rate (N,) [rad]:
-    where the body is heading. Zero without the balance strategy."""
-    gravity: Tensor
-    """Filtered gravity direction in the pelvis frame (N, 3); zero until the first measurement."""
-    tilt_rate: Tensor
-    """Filtered angular velocity about x and y in the pelvis frame (N, 2) [rad/s]."""
-    steady_tilt: Tensor
-    """Slow average of the tilt about x and y (N, 2) [rad]."""
-    acceleration: Tensor
-    """Filtered acceleration of the velocity reference (N, 2), with that of turning [m/s^2]."""
-    swing_trim: Tensor
-    """Turn of the waist against the yaw rate in time with the gait: cosine and sine parts of its first three harmonics
-    (N, 6) [rad]."""
-    velocity_trim: Tensor
-    """What the march adds to the velocity reference against a lasting error (N, 3) [m/s, m/s, rad/s]."""
-    torso_trim: Tensor
-    """What waist roll and pitch take up of a lasting torso error (N, 2) [rad]."""
-
-    @classmethod
-    def standing(cls, reference: Tensor) -> NominalState:
-        """At rest at ``reference`` (N, 21)."""
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(len(reference), *shape, device=reference.device)
-
-        return cls(
-            reference=reference,
-            phase=zeros(),
-            walking=zeros(),
-            stopping=zeros(),
-            stepping=zeros(),
-            settling=zeros(),
-            unbalance=zeros(),
-            gravity=zeros(3),
-            tilt_rate=zeros(2),
-            steady_tilt=zeros(2),
-            acceleration=zeros(2),
-            swing_trim=zeros(6),
-            velocity_trim=zeros(3),
-            torso_trim=zeros(2),
-        )
 
 
 class _Attitude(NamedTuple):
@@ -211,9 +153,19 @@ class NominalMotion:
         return torch.cat([state.reference[:, VELOCITY], self._posture(state, command), command[:, ARMS]], dim=1)
 
     def _posture(self, state: NominalState, command: Tensor) -> Tensor:
-        """Posture of ``command`` (N, 21), or of the reference while the robot settles (N, 4)."""
-        settles = (state.settling > 0.0) & ~is_walking(command)
-        return torch.where(settles[:, None], state.reference[:, POSTURE], command[:, POSTURE])
+        """Posture of ``command`` (N, 21), or of the reference while the robot settles (N, 4).
+
+        The torso's yaw, which hardly moves the centre of mass, only waits for the march to end. A robot that marches to
+        catch itself goes on to the nearest posture in which it can.
+        """
+        stands, held = ~is_walking(command), state.reference[:, POSTURE]
+        settles = stands & (state.settling > 0.0)
+        marches = settles & (state.walking > 0.0)
+        waits = torch.stack([settles, settles, settles, marches], dim=1)
+        recovers = stands & (state.stepping > 0.0)
+        torso = held[:, 1:].clamp(-self._stepping_torso, self._stepping_torso)
+        marching = torch.cat([held[:, :1].clamp_min(self.config.recovery_height), torso], dim=1)
+        return torch.where(recovers[:, None], marching, torch.where(waits, held, command[:, POSTURE]))
 
     def advance(self, state: NominalState, command: Tensor) -> NominalState:
         """One control step of reference filter and gait clock towards ``command`` (N, 21)."""
@@ -230,7 +182,8 @@ class NominalMotion:
         rests = (reference[:, POSTURE] == goal[:, POSTURE]).all(dim=1)
         is_upright = (reference[:, TORSO].abs() <= self._stepping_torso).all(dim=1)
         is_tall = reference[:, HEIGHT] >= config.stepping_height
-        steps = loses_balance & rests & is_upright & is_tall
+        falls = (state.unbalance > config.recovery_threshold) & (state.walking <= 0.5)
+        steps = (loses_balance & rests & is_upright & is_tall) | falls
         stepping = torch.where(steps, config.stepping_time, (state.stepping - period).clamp_min(0.0))
         to_stop = config.stopping_time * reference[:, VELOCITY].norm(dim=1)
         stopping = torch.maximum((state.stopping - period).clamp_min(0.0), to_stop)
@@ -395,17 +348,19 @@ class NominalMotion:
     def _balance(self, state: NominalState, attitude: _Attitude) -> tuple[Tensor, NominalState]:
         """How much of each row of ``_BALANCE`` there is (N, 8) [rad], and the state of the feedback.
 
-        Ankles and, marching, steps lean against the pelvis' tilt off its nominal attitude. The capture point of a
-        falling pendulum lies in the direction of tilt + rate * sqrt(height / g) (Pratt et al., Humanoids 2006), so
-        the swing hip moves the foot that way. A pendulum that accelerates at a leans by a / g.
+        Ankles and, marching, steps lean against the pelvis' tilt off its nominal attitude, and against its tilt rate
+        off the nominal one: a pelvis that moves to another posture as it should is not to be held back. The capture
+        point of a falling pendulum lies in the direction of tilt + rate * sqrt(height / g) (Pratt et al., Humanoids
+        2006), so the swing hip moves the foot that way. A pendulum that accelerates at a leans by a / g.
         """
         config, walking = self.config, state.walking[:, None]
         lean = self._effort(state)[:, :2] * self._lean + config.acceleration_lean / GRAVITY * state.acceleration
         lean = lean.clamp(-config.largest_lean, config.largest_lean) * walking
         upright = -attitude.torso[:, 2]
-        wanted = torch.nn.functional.pad(lean, (0, 1)) + (attitude.waist @ upright[:, :, None])[:, :, 0]
+        state, nominal_rate = self._follow(state, (attitude.waist @ upright[:, :, None])[:, :, 0])
+        wanted = torch.nn.functional.pad(lean, (0, 1)) + state.nominal_gravity
         tilt = torch.linalg.cross(state.gravity, wanted)[:, :2]
-        rate = state.tilt_rate
+        rate = state.tilt_rate - nominal_rate
         ankle = config.balance_stiffness * tilt + config.balance_damping * rate
         capture = config.step_stiffness * tilt + config.step_damping * rate
         swing = torch.sin(state.phase + config.capture_lead)[:, None] * walking
@@ -420,3 +375,17 @@ class NominalMotion:
         trim = trim.clamp(-config.largest_torso_trim, config.largest_torso_trim)
         balance = torch.cat([ankle, swing * capture, lean, trim], dim=1)
         return balance, state._replace(unbalance=unbalance, steady_tilt=steady_tilt, torso_trim=trim)
+
+    def _follow(self, state: NominalState, gravity: Tensor) -> tuple[NominalState, Tensor]:
+        """Let the lagging gravity direction follow the nominal one (N, 3), both in the pelvis frame.
+
+        Returns:
+            the state, and the tilt rate about x and y (N, 2) [rad/s] that goes with it.
+        """
+        is_first = (state.nominal_gravity == 0.0).all(dim=1, keepdim=True)
+        lagging = torch.where(is_first, gravity, state.nominal_gravity)
+        speed = (gravity - lagging) / (self.config.attitude_lag + self.control_period)
+        lagging = lagging + self.control_period * speed
+        # A direction that is fixed in the world moves by -omega x direction in the pelvis frame.
+        rate = torch.linalg.cross(speed, lagging)[:, :2]
+        return state._replace(nominal_gravity=lagging), rate

@@ -19,11 +19,11 @@ class NominalConfig:
     """Steps of one foot per second [Hz]."""
     velocity_rate: float = 1.5
     """Slew rate of the velocity reference [m/s^2] and [rad/s^2]: steps go on until the robot has slowed down."""
-    height_rate: float = 0.25
+    height_rate: float = 0.4
     """Slew rate of the base height reference [m/s]."""
     torso_rate: tuple[float, float, float] = (1.0, 1.0, 2.0)
     """Slew rates of the torso's roll, pitch and yaw reference [rad/s]; yaw hardly moves the centre of mass."""
-    arm_rate: float = 4.0
+    arm_rate: float = 5.0
     """Slew rate of the arm reference [rad/s]."""
     stopping_time: float = 1.8
     """A march outlasts a command to stop by this long per speed that was to be lost [s per m/s]; less than
@@ -31,8 +31,8 @@ class NominalConfig:
     walking_ramp: float = 0.2
     """Time over which the march fades in and out [s]."""
     settling_time: float = 0.5
-    """A robot told to stand keeps its posture until its march has been over for this long [s]; 0: it does not wait
-    for the march either."""
+    """A robot told to stand keeps its posture until its march has been over for this long, and for this long from the
+    start [s]; 0: it does not wait for the march either."""
     knee_lift: float = 0.72
     """Knee flexion at mid-swing [rad]; hip and ankle take half of it back."""
     soft_landing: bool = True
@@ -81,6 +81,8 @@ class NominalConfig:
     the rest on. 1: it balances on the measurement, whose noise shakes the hips."""
     rate_gain: float = 0.5
     """The same for the measured tilt rate, of which the rest is the one of the step before."""
+    attitude_lag: float = 0.08
+    """Time by which the pelvis lags behind its nominal attitude; the balance reckons with it [s]."""
     balance_stiffness: float = 3.1
     """Ankle correction per tilt of the pelvis off its nominal attitude [rad/rad]; 0 switches the strategy off."""
     balance_damping: float = 0.245
@@ -109,3 +111,8 @@ class NominalConfig:
     """Lowest base height reference at which it does: a deep squat leaves the legs no room [m]."""
     stepping_torso: tuple[float, float, float] = (0.2, 0.5, 0.5)
     """Largest torso roll, pitch and yaw references at which it does [rad]."""
+    recovery_threshold: float = 0.2
+    """:attr:`NominalState.unbalance` from which a robot that stands in any posture does so, whether it rests or not; on
+    the way it straightens up to where it can, and takes up its posture again once it has settled [rad]."""
+    recovery_height: float = 0.6
+    """Base height that it then rises to [m]."""

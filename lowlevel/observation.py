@@ -14,7 +14,8 @@ from torch import Tensor
 
 from lowlevel import commands
 from lowlevel.commands import COMMAND_SIZE, CommandSpace
-from lowlevel.nominal import NominalMotion, NominalState
+from lowlevel.nominal import NominalMotion
+from lowlevel.nominal_state import NominalState
 from lowlevel.terrain import MAP_MIRROR, MAP_SIZE
 from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS
 from robots.g1.mirror import AXIAL_VECTOR, JOINTS_MIRROR, VECTOR, Mirror, concatenate, signs

@@ -49,7 +49,8 @@ def export_step(step: ControlStep, space: CommandSpace, path: Path) -> None:
     """Write :data:`INPUTS` to :data:`OUTPUTS` as an ONNX file, for any number of robots."""
     count = 2
     measured = [torch.zeros(count, size) for size in (NUM_JOINTS, NUM_JOINTS, 3, 3, MAP_SIZE)]
-    inputs = (*measured, space.neutral().repeat(count, 1), torch.ones(count, 1), *Memory.fresh(count, space).tensors)
+    memory = Memory.fresh(count, space, step.motion.config.settling_time).tensors
+    inputs = (*measured, space.neutral().repeat(count, 1), torch.ones(count, 1), *memory)
     rows = torch.export.Dim("robots")
     program = torch.onnx.export(
         _Flat(step).eval(),

@@ -20,7 +20,13 @@ def _environment(**changes: object) -> EnvironmentConfig:
 
 PRESETS: dict[str, TrainingConfig] = {
     "flat": FLAT,
-    "simple": replace(FLAT, environment=_environment(terrain=TerrainConfig(tiles=("flat", "irregular")))),
+    # The shipped pilot-g1-simple. Blind, as the paper's row of that name: of slabs that differ by 2 cm, seen with 2 cm
+    # of noise, the map told the policy nothing, and an update without it takes half the time.
+    "simple": replace(
+        FLAT,
+        environment=_environment(terrain=TerrainConfig(tiles=("flat", "irregular"), tile_size=16.0)),
+        network=replace(FLAT.network, vision=False),
+    ),
     # Ablations of the paper
     "no-vision": replace(FLAT, network=replace(FLAT.network, vision=False)),
     "no-attention": replace(FLAT, network=replace(FLAT.network, attention=False)),

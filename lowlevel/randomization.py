@@ -23,15 +23,15 @@ class RandomizationConfig:
     """Sliding friction of the feet."""
     added_mass: tuple[float, float] = (-1.0, 2.0)
     """Added to the pelvis and, independently, to the torso [kg]."""
-    center_of_mass_shift: float = 0.03
+    center_of_mass_shift: float = 0.02
     """Half-width of the shift of pelvis and torso centres of mass, per axis [m]."""
     gain_scale: tuple[float, float] = (0.9, 1.1)
     """Factor on stiffness and damping, per joint."""
     joint_offset: float = 0.01
     """Half-width of the calibration error of each joint encoder [rad]."""
-    delay_probability: float = 0.5
+    delay_probability: float = 0.3
     """Chance that a robot's targets arrive one control step late for the whole episode."""
-    hand_load_probability: float = 0.5
+    hand_load_probability: float = 0.4
     """Chance that the hands carry a load in an episode, once arms are being trained."""
     hand_payload: tuple[float, float] = (0.0, 12.0)
     """Downward force on each hand [N]."""

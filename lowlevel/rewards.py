@@ -20,11 +20,11 @@ class RewardWeights:
 
     # Table I, task rewards; the paper's own weights are PAPER_WEIGHTS
     linear_velocity: float = 3.0
-    angular_velocity: float = 3.0
+    angular_velocity: float = 4.5
     base_height: float = 3.0
     torso_orientation: float = 3.0
     upper_body_position: float = 2.0
-    termination: float = -50.0
+    termination: float = -200.0
     # Table I, regularisation
     action_rate: float = -0.01
     energy: float = -0.001
@@ -49,10 +49,8 @@ PAPER_WEIGHTS = RewardWeights(
     base_height=1.0,
     torso_orientation=1.0,
     upper_body_position=1.0,
-    termination=-200.0,
 )
-"""The paper's weights where the defaults are others: tracking counts for more, and a fall, which also ends all reward
-to come, for less."""
+"""The paper's weights where the defaults are others: tracking counts for more here."""
 
 
 @dataclass(frozen=True)

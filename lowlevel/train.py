@@ -33,7 +33,7 @@ class Arguments:
     """Train a PILOT controller for the Unitree G1."""
 
     config: Annotated[TrainingConfig, tyro.conf.arg(name="")]
-    preset: str = "flat"
+    preset: str = "simple"
     """Named configuration to start from, a key of lowlevel.presets.PRESETS."""
     output: Path = Path("runs/lowlevel")
     """Parent folder of the run's folder."""

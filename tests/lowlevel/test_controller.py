@@ -65,8 +65,8 @@ def test_onnx_file_needs_nothing_of_this_package(folder: Path) -> None:
     """A port feeds measurements and what came out last, by name, for any number of robots."""
     session = onnxruntime.InferenceSession(folder / ONNX_FILE)
     steps = golden_steps(folder)
-    space = Controller.load(folder).config.command_space
-    fresh = Memory.fresh(4, space).tensors
+    config = Controller.load(folder).config
+    fresh = Memory.fresh(4, config.command_space, config.nominal.settling_time).tensors
     memory = {name: value.numpy() for name, value in zip(MEMORY_NAMES, fresh, strict=True)}
     for step in steps:
         measured = {name: value.numpy() for name, value in step.items() if name in INPUTS and name not in memory}

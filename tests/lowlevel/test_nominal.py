@@ -18,8 +18,9 @@ from lowlevel.commands import (
     CommandSpace,
     command_space,
 )
-from lowlevel.nominal import NominalMotion, NominalState
+from lowlevel.nominal import NominalMotion
 from lowlevel.nominal_config import NominalConfig
+from lowlevel.nominal_state import NominalState
 from robots.g1.constants import (
     ARM_JOINTS,
     DEFAULT_POSITION,
@@ -57,9 +58,9 @@ def test_references_slew_at_their_rates_and_arrive(space: CommandSpace) -> None:
     state = NominalState.standing(start)
     state = nominal.advance(state, command)
     change = state.reference - start
-    assert change[0, HEIGHT].item() == pytest.approx(-0.25 * 0.02)
-    assert change[0, TORSO.start + 1].item() == pytest.approx(1.0 * 0.02)
-    assert change[0, ARMS.start].item() == pytest.approx(4.0 * 0.02)
+    assert change[0, HEIGHT].item() == pytest.approx(-nominal.config.height_rate * 0.02, abs=1e-6)
+    assert change[0, TORSO.start + 1].item() == pytest.approx(nominal.config.torso_rate[1] * 0.02)
+    assert change[0, ARMS.start].item() == pytest.approx(nominal.config.arm_rate * 0.02)
     for _ in range(60):
         state = nominal.advance(state, command)
     assert torch.allclose(state.reference, command)
@@ -191,10 +192,23 @@ def test_a_robot_told_to_stop_settles_before_it_changes_posture(space: CommandSp
     expected = slowing_down + nominal.config.walking_ramp + nominal.config.settling_time
     # Each of the three ends within a control step, and steps count from zero.
     assert steps_until_it_moves(walking) * 0.02 == pytest.approx(expected, abs=4 * 0.02)
+    from_the_start = NominalState.standing(space.neutral()[None], nominal.config.settling_time)
+    assert steps_until_it_moves(from_the_start) * 0.02 == pytest.approx(nominal.config.settling_time, abs=0.03)
     at_once = motion(settling_time=0.0)
     stopping = at_once.advance(at_once.advance(walking, walk), squat)
     tracked = at_once.tracked_command(stopping, squat)
     assert torch.equal(tracked[:, VELOCITY.stop :], squat[:, VELOCITY.stop :])
+
+
+def test_torso_yaw_waits_for_the_end_of_the_march_alone(space: CommandSpace) -> None:
+    nominal = motion()
+    turned = space.neutral()[None].clone()
+    turned[:, HEIGHT], turned[:, TORSO.stop - 1] = 0.5, 1.0
+    state = NominalState.standing(space.neutral()[None], nominal.config.settling_time)
+    for walking, yaw in ((0.0, 1.0), (1.0, 0.0)):
+        tracked = nominal.tracked_command(state._replace(walking=torch.full((1,), walking)), turned)
+        assert tracked[0, HEIGHT].item() == space.neutral()[HEIGHT].item()
+        assert tracked[0, TORSO.stop - 1].item() == yaw
 
 
 def test_the_march_takes_up_a_lasting_velocity_error_within_bounds(space: CommandSpace) -> None:
@@ -280,12 +294,48 @@ def test_a_robot_that_leans_into_a_turn_is_in_balance(space: CommandSpace) -> No
     assert abs(stands - balanced) > 0.1
 
 
-def test_a_robot_in_a_deep_squat_does_not_march(space: CommandSpace) -> None:
+def test_a_robot_in_a_deep_squat_only_marches_when_it_falls_and_rises_for_that(space: CommandSpace) -> None:
     nominal = motion()
+    config = nominal.config
     squat = space.neutral()[None].clone()
-    squat[:, HEIGHT] = 0.4
-    falling = NominalState.standing(squat)._replace(unbalance=torch.ones(1))
-    assert nominal.advance(falling, squat).walking.item() == 0.0
+    squat[:, HEIGHT], squat[:, TORSO.start + 1] = 0.4, 1.0
+    swaying = NominalState.standing(squat)._replace(unbalance=torch.full((1,), config.recovery_threshold - 0.01))
+    assert nominal.advance(swaying, squat).walking.item() == 0.0
+    state = NominalState.standing(squat)._replace(unbalance=torch.full((1,), config.recovery_threshold + 0.01))
+    heights = []
+    for _ in range(400):
+        state = nominal.advance(state, squat)._replace(unbalance=torch.zeros(1))
+        heights.append(state.reference[0, HEIGHT].item())
+    rising_time = min(config.stepping_time, (config.recovery_height - 0.4) / config.height_rate)
+    assert max(heights) == pytest.approx(min(0.4 + rising_time * config.height_rate, config.recovery_height), abs=0.01)
+    back = 0.02 * (len(heights) - heights[::-1].index(max(heights)))
+    assert back == pytest.approx(config.stepping_time + config.walking_ramp + config.settling_time, abs=0.1)
+    assert torch.allclose(state.reference, squat)
+
+
+def test_a_pelvis_that_moves_as_it_should_is_not_out_of_balance(space: CommandSpace) -> None:
+    """The gravity and the gyroscope of a pelvis that follows its nominal pitch with the lag that is reckoned with."""
+    bend = space.neutral()[None].clone()
+    bend[:, TORSO.start + 1] = 0.8
+
+    def largest_unbalance(reckoned: float, lag: float = 0.08) -> float:
+        nominal = motion(attitude_lag=reckoned, gravity_gain=1.0, rate_gain=1.0, carry_arms=False)
+        state = NominalState.standing(space.neutral()[None])
+        pitch, largest = None, 0.0
+        for _ in range(60):
+            state = nominal.advance(state, bend)
+            waist = nominal.pose.lookup(state.reference[:, POSTURE]).position[0, WAIST_JOINTS]
+            wanted = state.reference[0, TORSO.start + 1].item() - waist[2].item()
+            before = wanted if pitch is None else pitch
+            pitch = before + 0.02 / (lag + 0.02) * (wanted - before)
+            gravity = torch.tensor([[np.sin(pitch), 0.0, -np.cos(pitch)]], dtype=torch.float32)
+            spin = torch.tensor([[0.0, (pitch - before) / 0.02, 0.0]], dtype=torch.float32)
+            state = nominal.joint_targets(state, DEFAULT, gravity, spin, STILL)[1]
+            largest = max(largest, state.unbalance.item())
+        return largest
+
+    assert largest_unbalance(reckoned=0.08) < 0.01
+    assert largest_unbalance(reckoned=0.0) > 0.03
 
 
 def test_arms_follow_the_reference_in_every_kind(space: CommandSpace) -> None:
