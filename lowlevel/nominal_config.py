@@ -19,18 +19,18 @@ class NominalConfig:
     """Steps of one foot per second [Hz]."""
     velocity_rate: float = 1.5
     """Slew rate of the velocity reference [m/s^2] and [rad/s^2]: steps go on until the robot has slowed down."""
-    height_rate: float = 0.4
+    height_rate: float = 0.45
     """Slew rate of the base height reference [m/s]."""
     torso_rate: tuple[float, float, float] = (1.0, 1.0, 2.0)
     """Slew rates of the torso's roll, pitch and yaw reference [rad/s]; yaw hardly moves the centre of mass."""
     arm_rate: float = 5.0
     """Slew rate of the arm reference [rad/s]."""
-    stopping_time: float = 1.8
+    stopping_time: float = 1.2
     """A march outlasts a command to stop by this long per speed that was to be lost [s per m/s]; less than
     1 / velocity_rate: it ends with the velocity reference."""
     walking_ramp: float = 0.2
     """Time over which the march fades in and out [s]."""
-    settling_time: float = 0.5
+    settling_time: float = 0.3
     """A robot told to stand keeps its posture until its march has been over for this long, and for this long from the
     start [s]; 0: it does not wait for the march either."""
     knee_lift: float = 0.72
@@ -111,7 +111,7 @@ class NominalConfig:
     """Lowest base height reference at which it does: a deep squat leaves the legs no room [m]."""
     stepping_torso: tuple[float, float, float] = (0.2, 0.5, 0.5)
     """Largest torso roll, pitch and yaw references at which it does [rad]."""
-    recovery_threshold: float = 0.2
+    recovery_threshold: float = 0.22
     """:attr:`NominalState.unbalance` from which a robot that stands in any posture does so, whether it rests or not; on
     the way it straightens up to where it can, and takes up its posture again once it has settled [rad]."""
     recovery_height: float = 0.6
