@@ -25,7 +25,7 @@ class NominalConfig:
     """Slew rates of the torso's roll, pitch and yaw reference [rad/s]; yaw hardly moves the centre of mass."""
     arm_rate: float = 5.0
     """Slew rate of the arm reference [rad/s]."""
-    stopping_time: float = 1.2
+    stopping_time: float = 1.5
     """A march outlasts a command to stop by this long per speed that was to be lost [s per m/s]; less than
     1 / velocity_rate: it ends with the velocity reference."""
     walking_ramp: float = 0.2
@@ -105,7 +105,7 @@ class NominalConfig:
     """Time constant of the slow average of the tilt, which is no unbalance [s]; 0: all of it is."""
     stepping_threshold: float = 0.16
     """:attr:`NominalState.unbalance` from which a standing robot marches to catch itself [rad]."""
-    stepping_time: float = 0.8
+    stepping_time: float = 1.1
     """How long it then marches [s]."""
     stepping_height: float = 0.55
     """Lowest base height reference at which it does: a deep squat leaves the legs no room [m]."""

@@ -170,7 +170,8 @@ def test_a_state_that_cannot_be_used_is_refused_and_left_alone(command: str, tmp
 
     def refusal() -> str:
         before = path.read_bytes()
-        network = ["--network.history-hidden", "16", "--network.map-hidden", "8", "--network.map-global", "4"]
+        network = ["--preset", "flat", "--network.history-hidden", "16", "--network.map-hidden", "8"]
+        network += ["--network.map-global", "4"]
         network += ["--network.expert-hidden", "16", "8", "--network.critic-hidden", "16"]
         network += ["--network.target-hidden", "16", f"--output={tmp_path / 'new'}", *ARGUMENTS]
         with pytest.raises(SystemExit) as exit_info:
