@@ -116,3 +116,7 @@ class NominalConfig:
     the way it straightens up to where it can, and takes up its posture again once it has settled [rad]."""
     recovery_height: float = 0.6
     """Base height that it then rises to [m]."""
+
+    def __post_init__(self) -> None:
+        if self.attitude_lag < 0.0:
+            raise ValueError(f"attitude_lag must not be negative, but it is {self.attitude_lag} s")

@@ -46,6 +46,11 @@ def test_references_slew_at_their_rates_and_arrive(space: CommandSpace) -> None:
     assert torch.allclose(state.reference, command)
 
 
+def test_a_negative_lag_is_refused() -> None:
+    with pytest.raises(ValueError, match="attitude_lag must not be negative"):
+        motion(attitude_lag=-0.02)
+
+
 def test_clock_runs_while_walking_and_rests_while_standing(space: CommandSpace) -> None:
     nominal = motion(gait_frequency=2.0, velocity_rate=1.0, stopping_time=0.0)
     stand, walk = space.neutral()[None], space.neutral()[None].clone()
