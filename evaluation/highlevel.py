@@ -40,6 +40,8 @@ SCRIPTED = "scripted"
 EPISODES_FILE = "episodes.json"
 LIFT_STAGE = "lift"
 """The stage whose passing counts as the partial success ``lift_up``, if a task has it."""
+SHOWN_FAILURES = 20
+"""Failed episodes that the report describes one by one."""
 ROBOTS = 32
 """Robots side by side."""
 
@@ -343,7 +345,26 @@ def _failure_section(evaluation: Evaluation) -> list[str]:
         numbers = [str(record.number) for record in evaluation.records if record.failure == name]
         shown = ", ".join(numbers[:8]) + (", …" if len(numbers) > 8 else "")
         rows.append([name.replace("_", " "), str(len(numbers)), format_figure(figure), shown])
-    return [markdown_table(["failure", "count", "share of episodes", "episode numbers"], rows)]
+    failed = [record for record in evaluation.records if record.failure is not None]
+    return [
+        markdown_table(["failure", "count", "share of episodes", "episode numbers"], rows),
+        "The first of them, with when they passed each stage. `run-demo --seed N --episode NUMBER` records one.",
+        "",
+        _failed_episodes(failed[:SHOWN_FAILURES], evaluation.stages),
+    ]
+
+
+def _failed_episodes(failed: list[EpisodeRecord], stages: tuple[str, ...]) -> str:
+    """A table with a line per failed episode: what it was like, and how far it came."""
+    conditions = list(failed[0].conditions)
+    rows = []
+    for record in failed:
+        times = [f"{time:.1f}" for time in record.stage_times]
+        times += ["-"] * (len(stages) - len(times))
+        what = [f"{record.conditions[name]:.2f}" for name in conditions]
+        cause = str(record.failure).replace("_", " ")
+        rows.append([str(record.number), *what, *times, f"{cause} at {record.duration:.1f}"])
+    return markdown_table(["episode", *conditions, *(f"{stage} [s]" for stage in stages), "end [s]"], rows)
 
 
 def _control_table(evaluation: Evaluation, figures: dict[str, Figure]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -36,6 +36,10 @@ class EpisodeRecord:
     duration: float
     """[s]"""
     total_reward: float
+    stage_times: tuple[float, ...] = ()
+    """When each passed stage was passed [s], to the decision."""
+    conditions: dict[str, float] = field(default_factory=dict)
+    """What :meth:`highlevel.task.Task.conditions` says about the episode."""
 
 
 Observer = Callable[[Tensor, Tensor, StepResult], None]
@@ -59,12 +63,18 @@ def run_episodes(
     policy.reset(rows(environment.num_envs))
     records: dict[int, EpisodeRecord] = {}
     total = torch.zeros(environment.num_envs)
+    stage_times: list[list[float]] = [[] for _ in range(environment.num_envs)]
+    conditions = _copy(environment.task.conditions())
     while len(records) < count:
         action = policy.act(observation)
         result = environment.step(action)
         total += result.reward
         for observer in observers:
             observer(observation, action, result)
+        for robot, (passed, duration) in enumerate(
+            zip(result.final_stage.tolist(), result.duration.tolist(), strict=True)
+        ):
+            stage_times[robot] += [round(duration, 3)] * (passed - len(stage_times[robot]))
         over = torch.nonzero(result.done)[:, 0]
         for robot in over.tolist():
             number = int(result.episode[robot])
@@ -76,14 +86,23 @@ def run_episodes(
                     failure=result.failures.get(robot),
                     duration=float(result.duration[robot]),
                     total_reward=float(total[robot]),
+                    stage_times=tuple(stage_times[robot]),
+                    conditions={name: float(values[robot]) for name, values in conditions.items()},
                 )
+            stage_times[robot] = []
         if len(over):
             total[over] = 0.0
+            conditions = _copy(environment.task.conditions())
             policy.reset(over)
             if on_progress is not None:
                 on_progress(len(records))
         observation = result.observation
     return [records[number] for number in sorted(records)]
+
+
+def _copy(conditions: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The task overwrites its own when an episode ends."""
+    return {name: values.clone() for name, values in conditions.items()}
 
 
 def success_rate(records: Sequence[EpisodeRecord]) -> float:

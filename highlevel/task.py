@@ -158,6 +158,10 @@ class Task(ABC):
         """How each robot's episode would be classified if it ended now (N names), given who has ``fallen``
         (N,)."""
 
+    def conditions(self) -> dict[str, Tensor]:
+        """What was drawn for each robot's episode (N,), by name and unit; reports show it beside a failure."""
+        return {}
+
     def expert(self, environment: Any) -> Any:
         """A scripted :class:`highlevel.episodes.Policy` for a ``CommandEnvironment`` of this task.
 

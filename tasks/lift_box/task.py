@@ -147,6 +147,12 @@ class LiftBox(Task):
         columns = zip(self.progress.stage.tolist(), fallen.tolist(), self._dropped().tolist(), strict=True)
         return [failure_name(*row) for row in columns]
 
+    def conditions(self) -> dict[str, Tensor]:
+        episode = self.episode
+        edges = dict(zip(("depth [m]", "width [m]", "height [m]"), episode.size.unbind(1), strict=True))
+        support = {"support [m]": episode.support_height}
+        return edges | support | {"mass [kg]": episode.mass, "friction": episode.friction}
+
     # -- observation -----------------------------------------------------------------------------------------
 
     def observe_object(self, measured: Measurement) -> Tensor:

@@ -8,10 +8,13 @@ import pytest
 
 from evaluation.highlevel import (
     Arguments,
+    Evaluation,
+    all_figures,
     control_names,
     evaluate,
     failure_figures,
     main,
+    report_text,
     success_figures,
     with_control,
 )
@@ -55,6 +58,17 @@ def test_failures_are_listed_by_frequency() -> None:
         ("fall", pytest.approx(0.4)),
         ("drop", pytest.approx(0.2)),
     ]
+
+
+def test_a_failed_episode_is_described_by_what_it_was_and_how_far_it_came() -> None:
+    won = EpisodeRecord(0, True, 3, None, 9.0, 0.0, (1.0, 2.0, 9.0), {"mass [kg]": 1.0})
+    lost = EpisodeRecord(7, False, 1, "not_upright", 15.0, 0.0, (4.0,), {"mass [kg]": 1.25})
+    arguments = Arguments("scripted")
+    evaluation = Evaluation(arguments, "c", None, ("walk", "lift", "hold"), [won, lost], {}, [], 1.0)
+    lines = report_text(evaluation, all_figures(evaluation)).splitlines()
+    assert "| episode | mass [kg] | walk [s] | lift [s] | hold [s] | end [s] |" in lines
+    assert "| 7 | 1.25 | 4.0 | - | - | not upright at 15.0 |" in lines
+    assert not any(line.startswith("| 0 |") for line in lines)
 
 
 def test_negative_controls_change_nothing_else() -> None:

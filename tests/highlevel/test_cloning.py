@@ -17,6 +17,8 @@ from highlevel.environment import CommandEnvironment, StepResult
 from highlevel.policy import PlannerNetwork, policy_arguments
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.measures import Measurement
+from tasks.lift_box.config import LiftBoxConfig
+from tasks.lift_box.episode import draw
 
 Make = Callable[..., CommandEnvironment]
 
@@ -147,6 +149,8 @@ def test_episode_records_do_not_depend_on_the_number_of_robots(
         assert [record.number for record in records] == [0, 1, 2, 3, 4]
         assert success_rate(records) == 1.0 and all(record.failure is None for record in records)
         assert records[0].duration == pytest.approx(0.2) and records[0].total_reward == pytest.approx(6.0)
+        drawn, _ = draw(LiftBoxConfig(), 9, torch.arange(5))
+        np.testing.assert_allclose([r.conditions["mass [kg]"] for r in records], drawn.mass, rtol=1e-6)
         seen[robots] = sorted(item for item in distances if item[0] < 5)
     assert [n for n, _ in seen[1]] == [n for n, _ in seen[3]]
     np.testing.assert_allclose([d for _, d in seen[1]], [d for _, d in seen[3]], atol=1e-4)

@@ -42,6 +42,9 @@ def test_its_expert_succeeds_and_can_be_evaluated(untrained_controller: Path, tm
     evaluation.main([*arguments, "--robots=4", "--threads=1", f"--output={tmp_path}"])
     figures = json.loads((tmp_path / "metrics.json").read_text())["figures"]
     assert figures["full"]["value"] == 1.0 and "lift_up" not in figures
+    episodes = json.loads((tmp_path / "episodes.json").read_text())
+    # Its one stage is success, and success ends the episode.
+    assert all(episode["stage_times"] == [pytest.approx(episode["duration"])] for episode in episodes)
 
 
 def test_a_planner_imitates_its_expert(
