@@ -40,11 +40,14 @@ POLICY_KEYS = ("frame", "elevation_map", "flag", "velocity", "latent")
 class PPOConfig:
     """Settings of the learner."""
 
-    steps_per_update: int = 48
-    """Control steps per robot and update."""
+    steps_per_update: int = 12
+    """Control steps per robot and update, at first."""
+    rollout_doublings: int = 2
+    """How often that number doubles over a run, after equal shares of it. Many small updates learn faster from
+    scratch; the better the policy, the more samples it takes to see what would improve it."""
     epochs: int = 4
     """Passes over the rollout per update."""
-    minibatches: int = 8
+    minibatches: int = 4
     """Gradient steps per pass."""
     gamma: float = 0.99
     """Discount per control step."""
@@ -95,6 +98,8 @@ class PPOConfig:
         for name in ("steps_per_update", "epochs", "minibatches"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.rollout_doublings < 0:
+            raise ValueError(f"rollout_doublings must not be negative, but it is {self.rollout_doublings}")
         if not 0 < self.estimator_epochs <= self.epochs:
             raise ValueError(f"estimator_epochs {self.estimator_epochs} is not between 1 and epochs {self.epochs}")
         if self.symmetry not in ("none", "augmentation", "loss"):

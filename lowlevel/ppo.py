@@ -31,7 +31,7 @@ OBSERVATION_KEYS = (*ACTOR_KEYS, "privileged")
 class PPO:
     """The algorithm: acts, records what came of it, and updates the networks once a rollout is full.
 
-    Call :meth:`act` and :meth:`record` in turn, ``steps_per_update`` times, then :meth:`update`. On the CPU
+    Call :meth:`act` and :meth:`record` in turn until the ``storage`` is full, then :meth:`update`. On the CPU
     everything that follows a restored :meth:`state_dict` is bit-identical to what would have followed without
     the interruption.
     """
@@ -86,13 +86,19 @@ class PPO:
         widths |= {"velocity": VELOCITY_SIZE, "latent": network_config.latent}
         shapes: dict[str, tuple[int, ...]] = {name: (width,) for name, width in widths.items()}
         shapes |= dict.fromkeys(("log_prob", "reward", "advantage", "returns"), ())
-        mirrored = config.symmetry == "augmentation"
-        self.storage = RolloutStorage(config.steps_per_update, num_envs, shapes, self.device, mirrored)
-        self._minibatch, rest = divmod(self.storage.size, config.minibatches)
-        if rest:
+        self._shapes = shapes
+        self.storage = self._room_for(config.steps_per_update, num_envs)
+        if self.storage.size % config.minibatches:
             raise ValueError(
                 f"{self.storage.size} samples per update do not split into {config.minibatches} minibatches"
             )
+
+    def _room_for(self, steps: int, num_envs: int) -> RolloutStorage:
+        return RolloutStorage(steps, num_envs, self._shapes, self.device, self.config.symmetry == "augmentation")
+
+    @property
+    def _minibatch(self) -> int:
+        return self.storage.size // self.config.minibatches
 
     @property
     def learning_rate(self) -> float:
@@ -136,6 +142,20 @@ class PPO:
         config, lowest = self.config, self.config.std_bounds[0]
         highest = config.initial_std * (config.final_std / config.initial_std) ** share
         self.learner.limit_noise(lowest, max(lowest, highest))
+
+    def lengthen(self, share: float) -> None:
+        """Make the next rollout as long as it is to be after ``share`` of the run, in [0, 1].
+
+        Raises:
+            ValueError: in the middle of a rollout.
+        """
+        config = self.config
+        doublings = min(int(share * (config.rollout_doublings + 1)), config.rollout_doublings)
+        steps = config.steps_per_update * 2**doublings
+        if self.storage.position > 0:
+            raise ValueError(f"step {self.storage.position} of a rollout of {self.storage.steps} is recorded already")
+        if steps != self.storage.steps:
+            self.storage = self._room_for(steps, self.storage.num_envs)
 
     @torch.no_grad()
     def deterministic(self, observation: Mapping[str, Tensor]) -> Tensor:

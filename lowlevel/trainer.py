@@ -143,14 +143,16 @@ class Trainer:
 
     @property
     def _steps_per_iteration(self) -> int:
-        return self.config.ppo.steps_per_update * self.config.environment.num_robots * world_size()
+        return self.ppo.storage.size * world_size()
 
     def iterate(self) -> dict[str, float]:
         """One rollout and one update; returns figures to log."""
         terms, tracking, falls = Averages(), Averages(), Averages()
-        self.ppo.calm(min(self.steps / self.config.total_steps, 1.0))
+        share = min(self.steps / self.config.total_steps, 1.0)
+        self.ppo.calm(share)
+        self.ppo.lengthen(share)
         started = time.monotonic()
-        for _ in range(self.config.ppo.steps_per_update):
+        for _ in range(self.ppo.storage.steps):
             action = self.ppo.act(self.observation)
             result = self.environment.step(action.cpu(), self.ppo.estimated_velocity.cpu())
             self.ppo.record(result.reward, result.terminated, result.truncated, result.next_privileged)
@@ -163,8 +165,8 @@ class Trainer:
         self.steps += self._steps_per_iteration
 
         mean_terms = terms.take()
-        share = falls.take()["share"]
-        self.fall_rate += 0.1 * (share - self.fall_rate) if self.ppo.updates > 1 else share - 1.0
+        fallen = falls.take()["share"]
+        self.fall_rate += 0.1 * (fallen - self.fall_rate) if self.ppo.updates > 1 else fallen - 1.0
         # No more than were taken: a run that has not fallen yet does not stand for ever.
         steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
         self.curriculum.update(mean_terms, min(steps_between_falls / self.environment.max_steps, 1.0))

@@ -70,7 +70,7 @@ def run_update(ppo: PPO, seed: int) -> dict[str, float]:
     generator = torch.Generator().manual_seed(seed)
     robots = ppo.storage.num_envs
     observed = observation(generator, robots)
-    for _ in range(ppo.config.steps_per_update):
+    for _ in range(ppo.storage.steps):
         action = ppo.act(observed)
         reward = -(action - best_action(observed)).square().sum(dim=1)
         ended = torch.rand(robots, generator=generator) < 0.1

@@ -19,7 +19,7 @@ def _fill(ppo: PPO, robots: slice, seed: int) -> dict[str, torch.Tensor]:
     """Fill the rollout with recorded data for ``robots`` of the 8; returns the observation after it."""
     generator = torch.Generator().manual_seed(seed)
     width = robots.stop - robots.start
-    for _ in range(ppo.config.steps_per_update):
+    for _ in range(ppo.storage.steps):
         observed = observation(generator, ROBOTS)
         action = 0.5 * torch.randn(ROBOTS, SIZES.action, generator=generator)
         reward = torch.randn(ROBOTS, generator=generator)

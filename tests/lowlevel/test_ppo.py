@@ -230,6 +230,23 @@ def test_noise_that_is_low_already_stays_and_is_not_calmed_below_its_bounds() ->
     torch.testing.assert_close(ppo.actor.log_std.exp(), torch.full((4,), 0.05))
 
 
+@pytest.mark.parametrize(("share", "steps"), [(0.0, 3), (0.3, 3), (0.34, 6), (0.66, 6), (0.67, 12), (1.0, 12)])
+def test_rollouts_double_after_equal_shares_of_a_run(share: float, steps: int) -> None:
+    ppo = make_ppo(4, steps_per_update=3, rollout_doublings=2, minibatches=2)
+    ppo.lengthen(share)
+    assert ppo.storage.steps == steps
+    figures = run_update(ppo, 0)
+    assert ppo.updates == 1 and math.isfinite(figures["kl"])
+
+
+def test_a_rollout_that_has_begun_keeps_its_length() -> None:
+    ppo = make_ppo(4, steps_per_update=3, minibatches=2)
+    ppo.act(observation(torch.Generator().manual_seed(0), 4))
+    ppo.record(torch.zeros(4), *torch.zeros(2, 4, dtype=torch.bool), torch.zeros(4, SIZES.privileged))
+    with pytest.raises(ValueError, match="step 1 of a rollout of 3"):
+        ppo.lengthen(1.0)
+
+
 def test_exploration_noise_is_correlated_as_stated() -> None:
     """And a restored state goes on with the same noise."""
     ppo = make_ppo(4096, noise_correlation=0.8, steps_per_update=12, minibatches=1)

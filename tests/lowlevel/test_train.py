@@ -86,6 +86,7 @@ def test_configuration_survives_json(tmp_path: Path) -> None:
 
 ARGUMENTS = [
     "--environment.num-robots", "8", "--environment.num-threads", "1", "--ppo.steps-per-update", "8",
+    "--ppo.rollout-doublings", "0",
     "--ppo.minibatches", "2", "--save-interval", "0",
 ]  # fmt: skip
 
