@@ -54,7 +54,7 @@ class Arguments:
     """Measure the speed of simulation, learning, controller and planner on this machine."""
 
     output: Path = Path("runs/evaluation/benchmark")
-    """Folder for report.md and metrics.json; files of an earlier report there are replaced."""
+    """Folder for report.md and metrics.json; files of the same name there are replaced."""
     robots: int = PRESETS["flat"].environment.num_robots
     """Robots of the batched simulation."""
     planner_robots: int = 64

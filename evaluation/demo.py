@@ -56,7 +56,7 @@ class Arguments:
     pictures: bool = True
     """Also render a picture at the start, at every stage and at the end, where OpenGL works."""
     output: Path = Path("runs/demo")
-    """Folder for the recording, report.md and pictures; files of an earlier demo there are replaced."""
+    """Folder for the recording, report.md and pictures; files of the same name there are replaced."""
     threads: int = os.cpu_count() or 1
     """Threads of the physics."""
 
@@ -119,7 +119,8 @@ def _run(arguments: Arguments) -> None:
     write_results(arguments.output, write)
     print(outcome_text(stories[0]))
     print(f"recording: {arguments.output / RECORDING_FILE}   report: {arguments.output / REPORT_FILE}")
-    print(f"watch it with: rerun {arguments.output / RECORDING_FILE}")
+    # It may lie in a virtual environment that is not active.
+    print(f"watch it with: {Path(sys.executable).with_name('rerun')} {arguments.output / RECORDING_FILE}")
 
 
 def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tuple[Story, VisualTwin]:

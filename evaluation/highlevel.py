@@ -69,7 +69,7 @@ class Arguments:
     sweep_episodes: int = 100
     """Episodes of each cell of a sweep."""
     output: Path = Path("runs/evaluation/highlevel")
-    """Folder for report.md, metrics.json and plots; files of an earlier report there are replaced."""
+    """Folder for report.md, metrics.json and plots; files of the same name there are replaced."""
     robots: int = ROBOTS
     """Robots side by side; the last digits of the figures depend on it."""
     threads: int = os.cpu_count() or 1
@@ -348,7 +348,8 @@ def _failure_section(evaluation: Evaluation) -> list[str]:
     failed = [record for record in evaluation.records if record.failure is not None]
     return [
         markdown_table(["failure", "count", "share of episodes", "episode numbers"], rows),
-        "The first of them, with when they passed each stage. `run-demo --seed N --episode NUMBER` records one.",
+        "The first of them, with when they passed each stage. Recorded by `run-demo` with the same planner, task and "
+        f"`--seed {evaluation.arguments.seed} --episode NUMBER`, one may end otherwise: it is simulated alone there.",
         "",
         _failed_episodes(failed[:SHOWN_FAILURES], evaluation.stages),
     ]

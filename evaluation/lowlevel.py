@@ -73,7 +73,7 @@ class Arguments:
     seed: int = 0
     """Seed of commands, starts, friction and noise; episode i is the same for every controller."""
     output: Path = Path("runs/evaluation/lowlevel")
-    """Folder for report.md, metrics.json and plots; files of an earlier report there are replaced."""
+    """Folder for report.md, metrics.json and plots; files of the same name there are replaced."""
     walk_episodes: int = WALK_EPISODES
     """Episodes of the walking test: 10 s at 0.5 m/s."""
     skill_episodes: int = SKILL_EPISODES

@@ -216,7 +216,7 @@ class CommandEnvironment:
 
         count, steps = self.num_envs, self.task.action.decision_steps
         reward = torch.zeros(count)
-        ended, terminated, success, fallen = (torch.zeros(count, dtype=torch.bool) for _ in range(4))
+        ended, success, fallen = (torch.zeros(count, dtype=torch.bool) for _ in range(3))
         observation = torch.zeros(count, self.observation_size)
         stage = torch.zeros(count, dtype=torch.long)
         failures: dict[int, str] = {}

@@ -38,8 +38,8 @@ from lowlevel.interrupts import stop_on_signals
 from lowlevel.progress import ProgressReport
 from lowlevel.provenance import describe_run
 
-SELECTION_SEED, DEMONSTRATION_SEED = 1_000_000, 2_000_000
-"""Seeds far from those of training and evaluation, so that no episode is met twice."""
+SELECTION_SEED, DEMONSTRATION_SEED, TRAINING_SEED = 1_000_000, 2_000_000, 3_000_000
+"""First seeds of the episodes for each purpose, far from each other and from those of evaluations: none is met twice."""
 
 
 class PlannerTrainer:
@@ -60,12 +60,15 @@ class PlannerTrainer:
         self.config = config
         self.folder = folder
         self.controller = config.controller
-        self.environment = self._build_environment(config.seed)
+        self.episode_seed = TRAINING_SEED + config.seed
+        self.environment = self._build_environment(self.episode_seed)
         self.controller_hash = content_hash(config.controller)
         self._selection_environment: CommandEnvironment | None = None
         self.vec_env = PlannerVecEnv(self.environment)
         self.scale = torch.cat([torch.full((block.size,), block.scale) for block in self.environment.blocks])
         self.model = PlannerPPO(config, self.vec_env, self.scale)
+        # PPO has just seeded the episodes with the seed of its weights.
+        self.vec_env.seed(self.episode_seed)
         self.phase = "demonstrations"
         self.best_rate = -1.0
         self.last_selection = -math.inf
@@ -253,7 +256,7 @@ class PlannerTrainer:
                 f"this run is for controller {controller}, but {self.controller} is {self.controller_hash} now: "
                 "start a new run"
             )
-        self.environment.reset(self.config.seed)
+        self.environment.reset(self.episode_seed)
         self.environment.episode = episode
         # The reset at the start of learning takes the episodes after these.
         self.vec_env._reset_seeds()

@@ -147,8 +147,8 @@ class CommandSampler:
         command[:, HEIGHT : ARMS.stop] = torch.where(
             works[:, None], command[:, HEIGHT : ARMS.stop], self.neutral[HEIGHT : ARMS.stop]
         )
-        is_slow = command[:, VELOCITY].norm(dim=-1) < STANDING_SPEED
-        command[is_slow, VELOCITY] = 0.0
+        stands = command[:, VELOCITY].norm(dim=-1) < STANDING_SPEED
+        command[stands, VELOCITY] = 0.0
         return command, works[:, None].float()
 
     def _sample_arms(self, count: int, openness: float, generator: torch.Generator) -> Tensor:

@@ -119,7 +119,7 @@ class Controller:
         self._compute = self.step if runtime is None else runtime
         self._memory: Memory | None = None
         self.gate = torch.zeros(0)
-        """Expert activations of the last :meth:`act` (N, 4)."""
+        """Expert activations of the last :meth:`act` (N, experts)."""
 
     # -- control ----------------------------------------------------------------------------------------------
 

@@ -57,7 +57,7 @@ class Curriculum:
         previous = 1.0
         for stage in STAGES:
             may_grow = previous >= self.config.required_opening
-            if may_grow and mean_terms.get(stage.reward, 0.0) > stage.threshold:
+            if may_grow and mean_terms[stage.reward] > stage.threshold:
                 opening[stage.name] = min(1.0, opening[stage.name] + self.config.growth)
             previous = opening[stage.name]
         self.open_range = CommandRange(**opening)

@@ -14,8 +14,8 @@ from lowlevel.controller import Controller, ControllerConfig, actor_sizes
 from lowlevel.environment import PilotEnvironment
 from lowlevel.networks import NetworkConfig, PilotActor
 from lowlevel.observation import FRAME, normalised_columns
-from lowlevel.provenance import git_revision, read_training_config
-from lowlevel.trainer import STATE_FILE, Trainer
+from lowlevel.provenance import find_state, git_revision, read_run_description, read_training_config
+from lowlevel.trainer import Trainer
 from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
 
 
@@ -39,8 +39,11 @@ def controller_config(environment: PilotEnvironment, network: NetworkConfig) -> 
     )
 
 
-def freeze(trainer: Trainer) -> Controller:
-    """The current policy of a run as a controller on the CPU, detached from the run."""
+def freeze(trainer: Trainer, revision: str | None = None) -> Controller:
+    """The current policy of a run as a controller on the CPU, detached from the run.
+
+    ``revision`` of the code that trained it: this one by default.
+    """
     config = controller_config(trainer.environment, trainer.config.network)
     actor = PilotActor(actor_sizes(), config.network, ~normalised_columns(FRAME))
     actor.load_state_dict({name: tensor.cpu() for name, tensor in trainer.ppo.actor.state_dict().items()})
@@ -49,15 +52,15 @@ def freeze(trainer: Trainer) -> Controller:
         "steps": trainer.steps,
         "hours": trainer.trained_seconds / 3600.0,
         "curriculum": trainer.curriculum.state_dict(),
-        "revision": git_revision(),
+        "revision": git_revision() if revision is None else revision,
         "torch": torch.__version__,
     }
     return Controller(config, actor, trainer.environment.motion.pose, provenance)
 
 
-def export_controller(trainer: Trainer, folder: Path) -> None:
-    """Freeze the current policy of ``trainer`` into a controller ``folder``."""
-    freeze(trainer).save(folder)
+def export_controller(trainer: Trainer, folder: Path, revision: str | None = None) -> None:
+    """Freeze the current policy of ``trainer`` into a controller ``folder``; ``revision`` as in :func:`freeze`."""
+    freeze(trainer, revision).save(folder)
 
 
 def export_run(run: Path, controller: Path) -> None:
@@ -65,9 +68,9 @@ def export_run(run: Path, controller: Path) -> None:
     config = read_training_config(run)
     small = replace(config, environment=replace(config.environment, num_robots=config.ppo.minibatches))
     trainer = Trainer(small, run)
-    trainer.load(run / STATE_FILE, with_environment=False)
+    trainer.load(find_state(run), with_environment=False)
     trainer.config = config  # provenance tells of the run, not of the small environment it was rebuilt in
-    export_controller(trainer, controller)
+    export_controller(trainer, controller, read_run_description(run).get("revision"))
     print(f"{trainer.steps} steps; the controller lies in {controller}")
 
 

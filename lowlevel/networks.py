@@ -30,7 +30,7 @@ class ActorOutput(NamedTuple):
     gate: Tensor
     """Probability of each expert (N, E); ones (N, 1) for the monolithic ablation."""
     velocity: Tensor
-    """Estimated base linear velocity (N, 3) [m/s], base frame."""
+    """Estimated base linear velocity (N, 3) [m/s], heading frame."""
     latent: Tensor
     """Predicted latent of the next state (N, latent), unit length."""
 
@@ -204,7 +204,8 @@ class TargetEncoder(nn.Module):
     """Encodes the true next state for the contrastive loss and owns its prototypes; training only.
 
     Commands are hidden from it: the history contains them too, and a latent that merely copies them would
-    already tell the samples of a batch apart.
+    already tell the samples of a batch apart. So are the other columns that are not normalised, which do not change
+    from step to step (the flag), or which the map encoder is for.
     """
 
     visible: Tensor

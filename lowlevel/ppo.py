@@ -51,7 +51,7 @@ class PPO:
         """Build networks, optimisers and storage.
 
         ``mirrors``: one per "history", "elevation_map", "privileged" and "action". ``command_columns`` (F,)
-        bool marks the frame columns that already have a fixed scale and are not normalised;
+        bool marks the frame columns that already have a fixed scale and are not normalised, commands above all;
         ``privileged_command_columns`` (P,) bool does the same for the critic and also hides these columns
         from the next-state encoder. Ranks draw different exploration noise from the same ``seed``.
 

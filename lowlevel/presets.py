@@ -18,20 +18,18 @@ def _environment(**changes: object) -> EnvironmentConfig:
     return replace(FLAT.environment, **changes)  # type: ignore[arg-type]
 
 
+SLABS = replace(FLAT, environment=_environment(terrain=TerrainConfig(tiles=("flat", "irregular"), tile_size=16.0)))
+
 PRESETS: dict[str, TrainingConfig] = {
-    "flat": FLAT,
     # The shipped pilot-g1-simple. Blind, as the paper's row of that name: of slabs that differ by 2 cm, seen with 2 cm
     # of noise, the map told the policy nothing, and an update without it takes half the time.
-    "simple": replace(
-        FLAT,
-        environment=_environment(terrain=TerrainConfig(tiles=("flat", "irregular"), tile_size=16.0)),
-        network=replace(FLAT.network, vision=False),
-    ),
-    # Ablations of the paper
-    "no-vision": replace(FLAT, network=replace(FLAT.network, vision=False)),
-    "no-attention": replace(FLAT, network=replace(FLAT.network, attention=False)),
-    "no-moe": replace(FLAT, network=replace(FLAT.network, mixture=False)),
-    # Ablations of this implementation's additions
+    "simple": replace(SLABS, network=replace(SLABS.network, vision=False)),
+    # The full network, and ablations of the paper; the one without vision is "simple"
+    "slabs": SLABS,
+    "no-attention": replace(SLABS, network=replace(SLABS.network, attention=False)),
+    "no-moe": replace(SLABS, network=replace(SLABS.network, mixture=False)),
+    # The full network on flat ground, and ablations of this implementation's additions
+    "flat": FLAT,
     "no-balance": replace(FLAT, environment=_environment(nominal=NominalConfig(balance_stiffness=0.0))),
     "nominal-pose": replace(FLAT, environment=_environment(nominal=NominalConfig(kind="pose"))),
     "nominal-default": replace(FLAT, environment=_environment(nominal=NominalConfig(kind="default"))),

@@ -2,8 +2,8 @@
 
 Above this module only randomisation (through :meth:`BatchSimulation.per_robot`) and scenes (which are ``MjSpec``) know
 MuJoCo's data structures.
-Base and joint quantities are exact; those read from sensors (torso, feet, palms, forces) are one physics substep
-old, as after any ``mj_step``.
+Positions and velocities of base and joints are exact; torques and what is read from sensors (torso, feet, palms,
+forces) are one physics substep old, as after any ``mj_step``.
 """
 
 from __future__ import annotations
@@ -94,6 +94,7 @@ class BatchSimulation:
             for i in range(model.nsensor)
         }
         self._per_robot_fields: dict[str, np.ndarray] = {}
+        self._diverged = np.zeros(num_robots, dtype=bool)
 
     def _free_joint_slices(self, body: str) -> tuple[slice, slice]:
         joint = self.model.body(body).jntadr[0]
@@ -139,9 +140,17 @@ class BatchSimulation:
         )
 
     def step(self, targets: Tensor) -> None:
-        """Advance one control step with PD targets (N, 29) [rad]."""
+        """Advance one control step with PD targets (N, 29) [rad].
+
+        Robots whose state is not finite afterwards return to the model's initial state; see :meth:`diverged`.
+        """
         self._ctrl[:, self._actuators] = targets.detach().cpu().numpy()
         self._batch.step(nstep=self.decimation)
+        # A sum is finite only if all of its terms are.
+        self._diverged = ~np.isfinite(self._batch.state.sum(axis=1))
+        if self._diverged.any():
+            # One number that is not finite would spoil the rewards and losses of all robots.
+            self._batch.reset(np.flatnonzero(self._diverged))
 
     def forward(self, ids: Tensor | None = None) -> None:
         """Recompute the derived quantities of ``ids`` (all by default) without advancing time."""
@@ -199,10 +208,8 @@ class BatchSimulation:
         self._batch.set_const(ids.cpu().numpy())
 
     def diverged(self) -> Tensor:
-        """Robots whose state is not finite (N,)."""
-        # A sum is finite only if all of its terms are.
-        finite = np.isfinite(self._batch.state.sum(axis=1))
-        return torch.from_numpy(~finite).to(self.device)
+        """Robots whose state was not finite after the last :meth:`step` (N,)."""
+        return torch.from_numpy(self._diverged).to(self.device)
 
     def robot_model(self, robot: int) -> mujoco.MjModel:
         """A copy of one robot's model, with its own field values, for rendering."""

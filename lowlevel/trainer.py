@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from lowlevel.curriculum import Curriculum, CurriculumConfig
+from lowlevel.curriculum import STAGES, Curriculum, CurriculumConfig
 from lowlevel.distributed import any_rank, average_over_ranks, rank, world_size
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
 from lowlevel.files import atomic_write
@@ -97,6 +97,11 @@ class Trainer:
     def __init__(self, config: TrainingConfig, folder: Path) -> None:
         self.config = config
         self.folder = folder
+        for stage in STAGES:
+            if getattr(config.environment.rewards, stage.reward) == 0.0:
+                raise ValueError(
+                    f"the curriculum opens {stage.name} by the reward {stage.reward}: its weight must not be 0"
+                )
         self.environment = PilotEnvironment(config.environment, seed=config.seed + 7919 * rank(), device="cpu")
         self.curriculum = Curriculum(config.curriculum)
         self.environment.open_range = self.curriculum.open_range
@@ -166,7 +171,10 @@ class Trainer:
 
         mean_terms = terms.take()
         fallen = falls.take()["share"]
-        self.fall_rate += 0.1 * (fallen - self.fall_rate) if self.ppo.updates > 1 else fallen - 1.0
+        if self.ppo.updates == 1:
+            self.fall_rate = fallen
+        else:
+            self.fall_rate += 0.1 * (fallen - self.fall_rate)
         # No more than were taken: a run that has not fallen yet does not stand for ever.
         steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
         self.curriculum.update(mean_terms, min(steps_between_falls / self.environment.max_steps, 1.0))

@@ -32,9 +32,9 @@ from robots.g1.constants import (
 )
 
 WORLD_COLLISION = 1
-"""Collision bit of the ground and of everything a foot or a palm can touch."""
+"""Collision bit of the ground and of everything else that feet can touch."""
 PALM_COLLISION = 2
-"""Collision bit of manipulated objects: palms touch these, feet touch both."""
+"""Collision bit of what palms can touch: manipulated objects."""
 
 _FOOT_SPHERES = ((-0.05, 0.025), (-0.05, -0.025), (0.12, 0.03), (0.12, -0.03))
 _FOOT_SPHERE_RADIUS = 0.02
@@ -113,6 +113,8 @@ def _set_physics(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.iterations = options.solver_iterations
     spec.option.ls_iterations = 20
+    # Whoever steps the robot ends the episode of one that diverged; MuJoCo would put it back upright, unseen.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if options.elliptic_friction:
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = 10.0
@@ -152,7 +154,7 @@ def _add_feet(spec: mujoco.MjSpec, options: ModelOptions) -> None:
 
 
 def _add_palms(spec: mujoco.MjSpec, options: ModelOptions) -> None:
-    """Palm plate, wrist block and finger plate, in the wrist-yaw frame (shape as in OmniContact's G1 model).
+    """Palm plate and wrist block, in the wrist-yaw frame (shape as in OmniContact's G1 model).
 
     The URDF's rubber hands are visual only, so without these the palms would pass through a box.
     """

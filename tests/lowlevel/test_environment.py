@@ -184,6 +184,20 @@ def test_mirrors_cover_their_vectors() -> None:
     assert sum(block.size for block in FRAME) == FRAME_SIZE
 
 
+def test_a_robot_that_diverges_falls_and_the_others_do_not_notice() -> None:
+    environment, undisturbed = PilotEnvironment(QUIET, seed=2), PilotEnvironment(QUIET, seed=2)
+    environment.reset(), undisturbed.reset()
+    environment.simulation._qvel[3, 10] = float("nan")
+    for step in range(3):
+        result = environment.step(torch.zeros(6, 29))
+        expected = undisturbed.step(torch.zeros(6, 29))
+        assert result.terminated.tolist() == [robot == 3 and step == 0 for robot in range(6)]
+        for values in (*result.observation.values(), result.reward, result.next_privileged):
+            assert bool(torch.isfinite(values).all())
+        others = torch.tensor([0, 1, 2, 4, 5])
+        torch.testing.assert_close(result.next_privileged[others], expected.next_privileged[others])
+
+
 def test_every_reward_weight_has_a_term_and_every_term_a_weight() -> None:
     assert {field.name for field in fields(RewardWeights)} == set(REWARD_TERMS)
 

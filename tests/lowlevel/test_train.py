@@ -145,6 +145,7 @@ def test_killed_run_resumes_from_its_last_save(tmp_path: Path) -> None:
     [
         (["--preset", "stairs"], "unknown preset 'stairs'"),
         (["--resume", "/nonexistent"], "/nonexistent holds no run.json"),
+        (["--environment.rewards.base-height", "0"], "opens height by the reward base_height"),
         (["--resume", "/nonexistent", "--preset", "flat"], "leave --preset out"),
         (["--warm-start", "/nonexistent"], "/nonexistent holds no training_state.pt"),
         (["--output", "/proc/nowhere"], "/proc/nowhere"),
