@@ -39,7 +39,7 @@ from lowlevel.progress import ProgressReport
 from lowlevel.provenance import describe_run
 
 SELECTION_SEED, DEMONSTRATION_SEED, TRAINING_SEED = 1_000_000, 2_000_000, 3_000_000
-"""First seeds of the episodes for each purpose, far from each other and from those of evaluations: none is met twice."""
+"""Seeds of the episodes for each purpose, far from each other and from those of evaluations, so none is met twice."""
 
 
 class PlannerTrainer:
