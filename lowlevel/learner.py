@@ -69,7 +69,7 @@ class PPOConfig:
     """Learning rate of the history encoder, the next-state encoder and the prototypes."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus [1/nat]."""
-    initial_std: float = 0.12
+    initial_std: float = 0.25
     """First standard deviation of the exploration noise [action units]."""
     final_std: float = 0.05
     """Standard deviation that the noise may have at most at the end of a run [action units]; the bound falls to it from

@@ -19,9 +19,9 @@ class RewardWeights:
     """Weight per second of each term; names are those of :data:`REWARD_TERMS`."""
 
     # Table I, task rewards; the paper's own weights are PAPER_WEIGHTS
-    linear_velocity: float = 3.0
-    angular_velocity: float = 4.5
-    base_height: float = 3.0
+    linear_velocity: float = 4.0
+    angular_velocity: float = 8.0
+    base_height: float = 3.5
     torso_orientation: float = 3.0
     upper_body_position: float = 2.0
     termination: float = -200.0

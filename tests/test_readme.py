@@ -8,6 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from evaluation import benchmark, demo
+from evaluation import highlevel as evaluate_highlevel
+from evaluation import lowlevel as evaluate_lowlevel
+from highlevel import train as train_highlevel
+from lowlevel import train as train_lowlevel
+
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
@@ -20,6 +26,33 @@ def test_the_example_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     targets = names["targets"]
     assert isinstance(targets, torch.Tensor)
     assert targets.shape == (1, 29) and targets.isfinite().all()
+
+
+def test_every_option_that_is_shown_exists(capsys: pytest.CaptureFixture[str]) -> None:
+    commands = {
+        "train-lowlevel": train_lowlevel.main,
+        "train-highlevel": train_highlevel.main,
+        "evaluate-lowlevel": evaluate_lowlevel.main,
+        "evaluate-highlevel": evaluate_highlevel.main,
+        "run-demo": demo.main,
+        "benchmark": benchmark.main,
+    }
+    lines = re.findall(r"^    (.+)$", README, flags=re.MULTILINE)
+    # Inline code may go on in the next line.
+    shown = [*lines, *(" ".join(code.split()) for code in re.findall(r"`([^`]+)`", README))]
+    used = {
+        name: {option for line in shown if re.search(rf"(^|[ =]){name}( |$)", line) for option in _options(line)}
+        for name in commands
+    }
+    assert sum(map(len, used.values())) > 10
+    for name, main in commands.items():
+        with pytest.raises(SystemExit):
+            main(["--help"])
+        assert used[name] <= _options(capsys.readouterr().out), name
+
+
+def _options(text: str) -> set[str]:
+    return set(re.findall(r"(?<![\w-])--[a-z][a-z0-9.-]*", text))
 
 
 def test_every_file_that_is_linked_exists() -> None:
