@@ -50,13 +50,13 @@ class PlannerTrainingConfig:
     """Name of a task: a folder under tasks/."""
     controller: Path | None = None
     """Folder of the frozen controller; pilot-g1-simple by default."""
-    demonstrations: int = 500
+    demonstrations: int = 400
     """Successful expert episodes to imitate first; 0 trains from nothing."""
     demonstration_file: Path | None = None
     """Use these recorded demonstrations instead of recording new ones."""
     demonstration_noise: float = 0.02
     """Standard deviation of the noise on the expert's executed actions."""
-    total_decisions: int = 3_000_000
+    total_decisions: int = 250_000
     """Planner decisions of PPO, over all robots."""
     num_envs: int = 64
     """Robots side by side."""
@@ -66,7 +66,7 @@ class PlannerTrainingConfig:
     """Of weights, episodes and exploration."""
     selection_episodes: int = 128
     """Fixed episodes that choose the best planner."""
-    selection_interval: int = 100_000
+    selection_interval: int = 50_000
     """Decisions between selections."""
     save_interval: float = 300.0
     """Time between saved training states [s]."""

@@ -19,8 +19,8 @@ class RewardWeights:
     """Weight per second of each term; names are those of :data:`REWARD_TERMS`."""
 
     # Table I, task rewards; the paper's own weights are PAPER_WEIGHTS
-    linear_velocity: float = 4.0
-    angular_velocity: float = 8.0
+    linear_velocity: float = 6.0
+    angular_velocity: float = 6.0
     base_height: float = 3.5
     torso_orientation: float = 3.0
     upper_body_position: float = 2.0
@@ -39,7 +39,7 @@ class RewardWeights:
     """Feet follow the gait clock: swing foot up, stance foot down."""
     base_motion: float = -0.05
     """Tumbling motion of the pelvis."""
-    velocity_progress: float = 1.0
+    velocity_progress: float = 4.0
     """Share of the commanded horizontal velocity that is reached, up to all of it."""
 
 
