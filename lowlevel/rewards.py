@@ -49,8 +49,9 @@ PAPER_WEIGHTS = RewardWeights(
     base_height=1.0,
     torso_orientation=1.0,
     upper_body_position=1.0,
+    velocity_progress=1.0,
 )
-"""The paper's weights where the defaults are others: tracking counts for more here."""
+"""The paper's weights where the defaults are others: tracking counts for more here, and with it what is added to it."""
 
 
 @dataclass(frozen=True)
