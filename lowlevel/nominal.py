@@ -177,9 +177,10 @@ class NominalMotion:
         vx, vy, yaw_rate = reference[:, VELOCITY].unbind(1)
         acceleration = change[:, :2] / period + torch.stack([-yaw_rate * vy, yaw_rate * vx], dim=1)
         share = period / (period + config.acceleration_time)
-        # A march sways by as much, so only one that fades out starts anew; so does a move to another posture.
+        # A march sways by as much, so only one that fades out starts anew; so does a move to another posture, with
+        # a command that jumps or one that the reference keeps up with.
         loses_balance = (state.unbalance > config.stepping_threshold) & (state.walking <= 0.5)
-        rests = (reference[:, POSTURE] == goal[:, POSTURE]).all(dim=1)
+        rests = (change[:, POSTURE] == 0.0).all(dim=1)
         is_upright = (reference[:, TORSO].abs() <= self._stepping_torso).all(dim=1)
         is_tall = reference[:, HEIGHT] >= config.stepping_height
         falls = (state.unbalance > config.recovery_threshold) & (state.walking <= 0.5)

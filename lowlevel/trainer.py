@@ -44,7 +44,7 @@ LOG_FILE = "log.jsonl"
 class TrainingConfig:
     """A training run: task, networks, learner and curriculum."""
 
-    total_steps: int = 40_000_000
+    total_steps: int = 25_000_000
     """Environment steps (robots times control steps), over all ranks."""
     seed: int = 0
     """Seed of weights, noise, commands and randomisation."""

@@ -116,6 +116,23 @@ def test_a_robot_in_a_deep_squat_only_marches_when_it_falls_and_rises_for_that(s
     assert torch.allclose(state.reference, squat)
 
 
+def test_a_robot_whose_command_moves_slowly_does_not_step_for_swaying(space: CommandSpace) -> None:
+    """A planner's command stays within the slew rates, so that the reference keeps up with it all the way."""
+    nominal = motion()
+    between = 0.5 * (nominal.config.stepping_threshold + nominal.config.recovery_threshold)
+    rising = space.neutral()[None].clone()
+    rising[:, HEIGHT] = 0.6
+    state = NominalState.standing(rising.clone())
+    for _ in range(20):
+        rising[:, HEIGHT] += 0.5 * nominal.config.height_rate * 0.02
+        state = nominal.advance(state._replace(unbalance=torch.full((1,), between)), rising)
+        assert state.reference[0, HEIGHT].item() == pytest.approx(rising[0, HEIGHT].item())
+        assert state.walking.item() == 0.0
+    for _ in range(2):
+        state = nominal.advance(state._replace(unbalance=torch.full((1,), between)), rising)
+    assert state.walking.item() > 0.0, "at rest it does"
+
+
 def test_a_pelvis_that_moves_as_it_should_is_not_out_of_balance(space: CommandSpace) -> None:
     """The gravity and the gyroscope of a pelvis that follows its nominal pitch with the lag that is reckoned with."""
     bend = space.neutral()[None].clone()
