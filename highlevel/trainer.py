@@ -70,7 +70,7 @@ class PlannerTrainer:
         # PPO has just seeded the episodes with the seed of its weights.
         self.vec_env.seed(self.episode_seed)
         self.phase = "demonstrations"
-        self.best_rate = -1.0
+        self.best_rate, self.best_duration = -1.0, math.inf
         self.last_selection = -math.inf
         self.trained_seconds = 0.0
         self._stop_requested = False
@@ -196,21 +196,24 @@ class PlannerTrainer:
         return Planner(config, PlannerActor.from_policy(self.model.policy, config.hidden), provenance)
 
     def select(self) -> float:
-        """Measure the success rate on the fixed selection episodes, and keep the planner if it is the best."""
+        """Measure the success rate on the fixed selection episodes, and keep the planner if it is the best.
+
+        Among equals, the one whose episodes are over soonest is.
+        """
         if self._selection_environment is None:
             self._selection_environment = self._build_environment(SELECTION_SEED)
         planner = self.planner()
         records = run_episodes(self._selection_environment, planner, self.config.selection_episodes, SELECTION_SEED)
-        rate = success_rate(records)
+        rate, duration = success_rate(records), sum(record.duration for record in records) / len(records)
         self.last_selection = self.model.num_timesteps
-        if rate > self.best_rate:
-            self.best_rate = rate
+        if (rate, -duration) > (self.best_rate, -self.best_duration):
+            self.best_rate, self.best_duration = rate, duration
             planner.provenance["selection"] = {"success_rate": rate, "episodes": len(records)}
             planner.save(self.folder / BEST_FOLDER)
         figures = stage_shares(records, self.environment.task.stages)
         figures["success_rate"] = rate
         figures["fall_rate"] = sum(record.failure == "fall" for record in records) / len(records)
-        figures["duration"] = sum(record.duration for record in records) / len(records)
+        figures["duration"] = duration
         self._log({f"selection/{name}": value for name, value in figures.items()})
         return rate
 
@@ -230,6 +233,7 @@ class PlannerTrainer:
             "phase": self.phase,
             "episode": self.environment.episode,
             "best_rate": self.best_rate,
+            "best_duration": self.best_duration,
             "last_selection": self.last_selection,
             "trained_seconds": self.trained_seconds,
         }
@@ -246,7 +250,8 @@ class PlannerTrainer:
         try:
             self.model.load_state_dict(state)
             self.phase, self.trained_seconds = state["phase"], state["trained_seconds"]
-            self.best_rate, self.last_selection = state["best_rate"], state["last_selection"]
+            self.best_rate, self.best_duration = state["best_rate"], state["best_duration"]
+            self.last_selection = state["last_selection"]
             episode, controller = state["episode"], state["controller"]
         except (KeyError, RuntimeError, ValueError) as error:
             reason = str(error).splitlines()[-1].strip()

@@ -65,7 +65,7 @@ class PlannerTrainingConfig:
     seed: int = 0
     """Of weights, episodes and exploration."""
     selection_episodes: int = 128
-    """Fixed episodes that choose the best planner."""
+    """Fixed episodes that choose the best planner: by successes, then by time."""
     selection_interval: int = 50_000
     """Decisions between selections."""
     save_interval: float = 300.0
