@@ -15,7 +15,7 @@ import torch
 import tyro
 
 from evaluation.highlevel import SCRIPTED, controller_for, make_policy
-from evaluation.pictures import NoOpenGLError, Painter, following_camera, save_picture
+from evaluation.pictures import NoOpenGLError, Painter, film_strip, following_camera, save_picture
 from evaluation.recording import EpisodeRecording, Recorder
 from evaluation.reports import (
     REPORT_FILE,
@@ -34,7 +34,9 @@ from lowlevel.controller import content_hash
 from lowlevel.measures import Measurement
 from lowlevel.progress import ProgressReport
 
-RECORDING_FILE, OUTCOME_FILE = "episode.rrd", "outcome.json"
+RECORDING_FILE, OUTCOME_FILE, STRIP_FILE = "episode.rrd", "outcome.json", "stages.png"
+STRIP_SIZE = (240, 320)
+"""Width and height of each stage's picture in the strip [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class Arguments:
     live: bool = False
     """Also show the episode in a rerun viewer while it runs."""
     pictures: bool = True
-    """Also render a picture at the start, at every stage and at the end, where OpenGL works."""
+    """Also render a picture at the start, at every stage and at the end, and a strip of the stages, where OpenGL
+    works."""
     output: Path = Path("runs/demo")
     """Folder for the recording, report.md and pictures; files of the same name there are replaced."""
     threads: int = os.cpu_count() or 1
@@ -110,7 +113,7 @@ def _run(arguments: Arguments) -> None:
 
     def write(output: Path) -> None:
         story, twin = run_episode(arguments, folder, output / RECORDING_FILE)
-        pictures = _draw(twin, story, output) if arguments.pictures else []
+        pictures = draw(twin, story, output) if arguments.pictures else []
         (output / REPORT_FILE).write_text(report_text(arguments, story, folder, pictures))
         outcome = {name: value for name, value in asdict(story).items() if name != "instants"}
         write_json(output / OUTCOME_FILE, outcome | identities(arguments, folder))
@@ -188,16 +191,26 @@ def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tupl
     return story, twin
 
 
-def _draw(twin: VisualTwin, story: Story, output: Path) -> list[str]:
-    """Draw all instants; returns the names of the pictures, none if this machine cannot render."""
-    names = []
+def draw(twin: VisualTwin, story: Story, output: Path) -> list[str]:
+    """Draw all instants, and those of the stages side by side; returns the names of the pictures.
+
+    There are none if this machine cannot render.
+    """
+    names: list[str] = []
+    stages: list[np.ndarray] = []
     try:
         with Painter(twin.model) as painter:
             for number, (instant, position) in enumerate(story.instants.items()):
                 twin.data.qpos[:] = position
                 mujoco.mj_forward(twin.model, twin.data)
+                pixels = painter.draw(twin.data, following_camera(twin.model, twin.data))
                 names.append(f"{number}_{instant}.png")
-                save_picture(output / names[-1], painter.draw(twin.data, following_camera(twin.model, twin.data)))
+                save_picture(output / names[-1], pixels)
+                if instant in story.stage_times:
+                    stages.append(pixels)
+        if stages:
+            names.insert(0, STRIP_FILE)
+            save_picture(output / STRIP_FILE, film_strip(stages, *STRIP_SIZE))
     except NoOpenGLError as error:
         print(error)
     return names

@@ -7,6 +7,7 @@ import importlib
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -143,6 +144,26 @@ def following_camera(
     camera.distance, camera.elevation = distance, elevation
     camera.azimuth = heading + azimuth
     return camera
+
+
+def film_strip(pictures: Sequence[np.ndarray], width: int, height: int) -> np.ndarray:
+    """``pictures`` (H, W, 3) next to each other (height, len * width, 3), each cut to its middle and scaled down.
+
+    Raises:
+        ValueError: if there are none, or one is smaller than what it is to become.
+    """
+    if not pictures:
+        raise ValueError("a film strip needs at least one picture")
+    parts = []
+    for pixels in pictures:
+        rows, columns = pixels.shape[:2]
+        scale = min(rows // height, columns // width)
+        if scale < 1:
+            raise ValueError(f"a picture of {columns} x {rows} pixels cannot be scaled down to {width} x {height}")
+        top, left = (rows - scale * height) // 2, (columns - scale * width) // 2
+        cut = pixels[top : top + scale * height, left : left + scale * width]
+        parts.append(cut.reshape(height, scale, width, scale, 3).mean(axis=(1, 3)).round().astype(np.uint8))
+    return np.hstack(parts)
 
 
 def save_picture(path: Path, pixels: np.ndarray) -> None:

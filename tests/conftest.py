@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from evaluation.pictures import NoOpenGLError, find_platform
 from lowlevel.commands import command_space
 from lowlevel.controller import Controller, ControllerConfig, actor_sizes
 from lowlevel.networks import NetworkConfig, PilotActor
@@ -18,6 +19,16 @@ from robots.g1.nominal_pose import NominalPose
 
 # Matrices are small here, and idle threads that spin slow everything down several-fold on a busy machine.
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def has_opengl() -> bool:
+    """Whether this machine can render pictures."""
+    try:
+        find_platform()
+    except NoOpenGLError:
+        return False
+    return True
 
 
 @pytest.fixture(scope="session")

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from evaluation.demo import Arguments, Story, main, outcome_text, run_episode
+from evaluation.demo import Arguments, Story, draw, main, outcome_text, run_episode
 
 
-def test_the_story_is_that_of_the_numbered_episode(untrained_controller: Path, tmp_path: Path) -> None:
+def test_the_story_is_that_of_the_numbered_episode(
+    untrained_controller: Path, tmp_path: Path, has_opengl: bool
+) -> None:
     stories: list[Story] = []
     for number in (0, 1):
         arguments = Arguments("scripted", seed=2, episode=number, threads=1)
@@ -20,6 +22,11 @@ def test_the_story_is_that_of_the_numbered_episode(untrained_controller: Path, t
     assert not np.array_equal(stories[0].instants["start"], stories[1].instants["start"])
     assert next(iter(stories[1].instants)) == "start" and list(stories[1].instants)[-1] == "end"
     box = twin.model.geom("box").size
+    where = stories[1].instants["start"]
+    story = Story(False, "drop", 1.0, {"approach": 0.5}, {"start": where, "approach": where, "end": where})
+    names = ["stages.png", "0_start.png", "1_approach.png", "2_end.png"] if has_opengl else []
+    assert draw(twin, story, tmp_path) == names
+    assert sorted(file.name for file in tmp_path.glob("*.png")) == sorted(names)
     assert ((box >= 0.125) & (box <= 0.175)).all() and len(set(box.tolist())) == 3, "the box has a drawn size"
 
 

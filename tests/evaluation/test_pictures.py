@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evaluation import pictures
-from evaluation.pictures import NoOpenGLError, Painter, find_platform, following_camera, save_picture
+from evaluation.pictures import NoOpenGLError, Painter, film_strip, find_platform, following_camera, save_picture
 from evaluation.visuals import VisualTwin
 
 
@@ -20,14 +20,6 @@ def twin() -> VisualTwin:
     twin.data.qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
     mujoco.mj_forward(twin.model, twin.data)
     return twin
-
-
-def has_opengl() -> bool:
-    try:
-        find_platform()
-    except NoOpenGLError:
-        return False
-    return True
 
 
 def test_the_camera_follows_position_and_heading(twin: VisualTwin) -> None:
@@ -55,8 +47,9 @@ def test_without_opengl_there_is_one_clear_sentence(monkeypatch: pytest.MonkeyPa
         find_platform.cache_clear()
 
 
-@pytest.mark.skipif(not has_opengl(), reason="this machine cannot render")
-def test_a_picture_shows_the_robot_in_front_of_the_camera(twin: VisualTwin, tmp_path: Path) -> None:
+def test_a_picture_shows_the_robot_in_front_of_the_camera(twin: VisualTwin, tmp_path: Path, has_opengl: bool) -> None:
+    if not has_opengl:
+        pytest.skip("this machine cannot render")
     path = tmp_path / "picture.png"
     with Painter(twin.model, width=160, height=120) as painter:
         camera = following_camera(twin.model, twin.data)
@@ -80,3 +73,18 @@ def test_a_picture_shows_the_robot_in_front_of_the_camera(twin: VisualTwin, tmp_
     assert rows[1] < rows[0] - 10, "the picture is upside down"
     stored = matplotlib.image.imread(path)
     np.testing.assert_allclose(stored[..., :3], pixels / 255.0, atol=0.01)
+
+
+def test_a_film_strip_shows_the_middle_of_each_picture() -> None:
+    first = np.zeros((70, 100, 3), dtype=np.uint8)
+    first[5:65, 30:70] = 200  # the middle 60 x 40
+    second = np.full((70, 100, 3), 50, dtype=np.uint8)
+    second[5:65:2, 30:70] = 150  # scaled down by two, its rows are averaged
+    strip = film_strip([first, second], width=20, height=30)
+    assert strip.shape == (30, 40, 3)
+    assert (strip[:, :20] == 200).all()
+    assert (strip[:, 20:] == 100).all()
+    with pytest.raises(ValueError, match="at least one"):
+        film_strip([], 20, 30)
+    with pytest.raises(ValueError, match="100 x 70 pixels cannot be scaled down to 20 x 90"):
+        film_strip([first], 20, 90)
