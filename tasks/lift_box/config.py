@@ -99,6 +99,9 @@ class RewardConfig:
     reach: float = 2.0
     grasp: float = 2.0
     lift: float = 4.0
+    lift_margin: float = 0.08
+    """Clearance beyond :attr:`StageConfig.carry_clearance` up to which a higher box is better [m]: with none, planners
+    hold it on the threshold and let it sink."""
     upright: float = 3.0
     stream: float = 0.02
     """Share of the potential that is paid at every decision, beside its progress."""

@@ -60,7 +60,7 @@ def potential(
     grasp = torch.where(stage >= GRASP, 1.0, (stage >= REACH).float() * both_close * squeeze)
 
     held = (progress.touching.all(dim=1) & (stage >= GRASP)).float()
-    clearance = (situation.bottom - support_height) / stages.carry_clearance
+    clearance = (situation.bottom - support_height) / (stages.carry_clearance + rewards.lift_margin)
     lift = held * clearance.clamp(0.0, 1.0)
     straight = torch.exp(-((situation.torso_pitch / 0.5) ** 2))
     risen = ((situation.base_height - 0.45) / (stages.upright_height - 0.45)).clamp(0.0, 1.0)

@@ -121,6 +121,16 @@ def test_lifting_pays_only_with_both_palms() -> None:
     assert _value(dropped, progress) < held - 1.0
 
 
+def test_a_box_held_with_a_margin_is_worth_more_than_one_on_the_threshold() -> None:
+    progress, rewards, stages = Progress.empty(1), RewardConfig(), StageConfig()
+    _run(progress, _UPRIGHT, 1.0)
+    on_threshold = replace(_UPRIGHT, bottom=torch.tensor([stages.carry_clearance]))
+    with_margin = replace(_UPRIGHT, bottom=torch.tensor([stages.carry_clearance + rewards.lift_margin]))
+    share = rewards.lift_margin / (stages.carry_clearance + rewards.lift_margin)
+    gained = _value(with_margin, progress) - _value(on_threshold, progress)
+    assert abs(gained - share * (rewards.lift + rewards.upright)) < 1e-5
+
+
 def test_the_success_bonus_exceeds_the_stream_of_never_finishing() -> None:
     rewards = RewardConfig()
     best = rewards.approach + rewards.posture + rewards.reach + rewards.grasp + rewards.lift + rewards.upright
