@@ -25,9 +25,9 @@ class PPOConfig:
     """Of the generalised advantage estimate."""
     learning_rate: float = 1e-4
     """Without demonstrations."""
-    learning_rate_after_cloning: float = 3e-5
-    """With demonstrations."""
-    log_std_after_cloning: float = -3.2
+    learning_rate_after_cloning: float = 1e-5
+    """With demonstrations: an update may change the policy by so much in units of its exploration, which is small."""
+    log_std_after_cloning: float = -4.0
     """Logarithm of the standard deviation of the action from then on: grasps that were cloned fail under the
     exploration that training from nothing needs."""
     clip_range: float = 0.15
@@ -36,7 +36,7 @@ class PPOConfig:
     """Updates stop early beyond 1.5 times this."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
-    warm_up_updates: int = 6
+    warm_up_updates: int = 2
     """Updates of the critic alone, after cloning."""
     warm_up_learning_rate: float = 1e-3
     """Of the critic during these."""
@@ -56,7 +56,7 @@ class PlannerTrainingConfig:
     """Use these recorded demonstrations instead of recording new ones."""
     demonstration_noise: float = 0.02
     """Standard deviation of the noise on the expert's executed actions."""
-    total_decisions: int = 250_000
+    total_decisions: int = 200_000
     """Planner decisions of PPO, over all robots."""
     num_envs: int = 64
     """Robots side by side."""
