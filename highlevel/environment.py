@@ -16,10 +16,11 @@ from torch import Tensor
 
 from highlevel.action import ActionMap, interpolate
 from highlevel.task import Decision, ObservationBlock, Task, rows
+from lowlevel.checks import require_finite
 from lowlevel.commands import COMMAND_SIZE, HEIGHT, POSTURE
 from lowlevel.controller import Controller, Proprioception
 from lowlevel.measures import Measurement, has_fallen, measure
-from lowlevel.rotations import conjugate, from_roll_pitch_yaw, multiply
+from lowlevel.rotations import about_axis, conjugate, multiply
 from lowlevel.simulation import BatchSimulation
 from lowlevel.terrain import Terrain, TerrainConfig
 from robots.g1.constants import (
@@ -94,7 +95,8 @@ class CommandEnvironment:
 
     Args:
         task: a fresh task, which this environment takes over.
-        controller: the frozen controller, or its folder.
+        controller: the frozen controller, or its folder. The environment uses a copy, because a controller
+            remembers its robots.
         num_envs: robots side by side.
         seed: seed of the episodes; robot i runs episodes i, i + N, i + 2 N, ...
         physics: accuracy and threads.
@@ -111,7 +113,8 @@ class CommandEnvironment:
         if num_envs < 1:
             raise ValueError(f"the number of environments is {num_envs}, but it must be at least 1")
         self.task = task
-        self.controller = controller if isinstance(controller, Controller) else Controller.load(controller)
+        given = controller if isinstance(controller, Controller) else Controller.load(controller)
+        self.controller = given.twin(num_envs)
         self.physics = PhysicsConfig() if physics is None else physics
         self.terrain = Terrain(TerrainConfig())
         self.simulation = self._build_simulation(num_envs)
@@ -180,11 +183,11 @@ class CommandEnvironment:
         joints = self._default.repeat(count, 1)
         joints[:, LOWER_JOINTS] = pose.lookup(neutral[:, POSTURE])[0]
         everything_zero = torch.zeros(count, 3)
-        self.simulation.reset(ids, everything_zero, _facing(torch.zeros(count)), joints)
+        self.simulation.reset(ids, everything_zero, about_axis(2, torch.zeros(count)), joints)
         start = self.task.reset(ids, self.seed, self.episode[ids])
         ground = self.terrain.height(start.position)
         base = torch.cat([start.position, (ground + neutral[:, HEIGHT] + START_CLEARANCE)[:, None]], -1)
-        orientation = multiply(_facing(start.heading), conjugate(_waist_rotation(joints[:, WAIST_JOINTS])))
+        orientation = multiply(about_axis(2, start.heading), conjugate(_waist_rotation(joints[:, WAIST_JOINTS])))
         self.simulation.set_object_pose(ids, PELVIS_BODY, torch.cat([base, orientation], -1))
         self.simulation.forward(ids)
         self.controller.reset(self.num_envs, ids)
@@ -277,7 +280,10 @@ class CommandEnvironment:
     def observe(self) -> Tensor:
         """Observation (N, D) in physical units: the paper's blocks, then the task's additions.
 
-        Numbers that are not finite, which only a diverged simulation has, become zero.
+        Raises:
+            RuntimeError: if :meth:`reset` was not called.
+            NonFiniteError: if a number is not finite. A simulation that diverged is put back to the model's initial
+                pose before it is seen.
         """
         measured = self.measured
         if measured is None:
@@ -296,7 +302,8 @@ class CommandEnvironment:
             ],
             dim=-1,
         )
-        return torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0)
+        require_finite("observation", observation)
+        return observation
 
 
 def _proprioception(measured: Measurement) -> Proprioception:
@@ -306,18 +313,7 @@ def _proprioception(measured: Measurement) -> Proprioception:
     )
 
 
-def _facing(heading: Tensor) -> Tensor:
-    """Quaternion (n, 4) of a rotation by ``heading`` (n,) about the vertical."""
-    zero = torch.zeros_like(heading)
-    return from_roll_pitch_yaw(torch.stack([zero, zero, heading], -1))
-
-
 def _waist_rotation(waist: Tensor) -> Tensor:
     """Torso relative to pelvis (n, 4) for waist joints (n, 3): yaw, then roll, then pitch."""
     yaw, roll, pitch = waist.unbind(-1)
-    zero = torch.zeros_like(yaw)
-    turns = [
-        from_roll_pitch_yaw(torch.stack(angles, -1))
-        for angles in ([zero, zero, yaw], [roll, zero, zero], [zero, pitch, zero])
-    ]
-    return multiply(multiply(turns[0], turns[1]), turns[2])
+    return multiply(multiply(about_axis(2, yaw), about_axis(0, roll)), about_axis(1, pitch))

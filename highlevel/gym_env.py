@@ -54,8 +54,11 @@ class PlannerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin the first episode of ``seed``, or the next episode."""
+        """Begin the first episode of ``seed``, or the next episode; without any seed so far, of a random one."""
         super().reset(seed=seed)
+        if seed is None and self.environment.measured is None:
+            # Workers that nobody seeds must not all run the same episodes.
+            seed = int(self.np_random.integers(2**31))
         observation = self.environment.reset(seed)
         self._is_over = False
         return observation[0].numpy(), {"episode_number": int(self.environment.episode[0])}

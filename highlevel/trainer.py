@@ -124,6 +124,8 @@ class PlannerTrainer:
             self.model.set_exploration(self.config.ppo.log_std_after_cloning)
             self._log({f"cloning/{name}": value for name, value in asdict(result).items()})
             self.planner().save(self.folder / CLONED_FOLDER)
+        # A run that was resumed before this has no seed pending, and recording has left its own.
+        self.vec_env.seed(self.episode_seed)
         self.phase = "ppo"
         self.save()
 

@@ -165,12 +165,16 @@ class Controller:
         return self._memory.nominal.reference
 
     def twin(self, num_robots: int) -> Controller:
-        """A controller on the CPU with copies of the weights and a fresh memory for ``num_robots`` robots."""
+        """A controller on the CPU with copies of the weights and a fresh memory for ``num_robots`` robots.
+
+        One that runs in ONNX Runtime stays there.
+        """
         pose = self.motion.pose
         tensors = [getattr(pose, name).cpu() for name in _POSE_TENSORS]
         actor = PilotActor(self.actor.sizes, self.config.network, ~normalised_columns(FRAME))
         actor.load_state_dict({name: tensor.cpu() for name, tensor in self.actor.state_dict().items()})
-        twin = Controller(self.config, actor, NominalPose(pose.axes, *tensors), self.provenance)
+        runtime = self._compute if isinstance(self._compute, OnnxStep) else None
+        twin = Controller(self.config, actor, NominalPose(pose.axes, *tensors), self.provenance, runtime=runtime)
         twin.reset(num_robots)
         return twin
 
@@ -236,6 +240,7 @@ class Controller:
         pose = {f"nominal_pose.{name}": getattr(self.motion.pose, name) for name in _POSE_TENSORS}
         _FOLDER.write_weights(folder, self.actor.state_dict() | pose)
         twin = self.twin(GOLDEN_ROBOTS)
+        twin._compute = twin.step  # golden vectors are torch's
         golden = golden_vectors(twin, self.config.command_space, golden_seed)
         export_step(twin.step, self.config.command_space, folder / ONNX_FILE)
         atomic_write(folder / GOLDEN_FILE, lambda file: file.write(json.dumps(golden).encode()))

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from highlevel.environment import CommandEnvironment, StepResult
-from highlevel.task import Decision, Outcome
+from highlevel.environment import CommandEnvironment, PhysicsConfig, StepResult
+from highlevel.task import Decision, Outcome, load_task
+from lowlevel.checks import NonFiniteError
 from lowlevel.commands import HEIGHT
+from lowlevel.controller import Controller
 from lowlevel.measures import Measurement
 
 Make = Callable[..., CommandEnvironment]
@@ -65,14 +69,29 @@ def test_an_episode_begun_in_the_middle_of_a_batch_equals_a_fresh_one(make_envir
         torch.testing.assert_close(a.final_observation[0], b.final_observation[0], rtol=1e-4, atol=1e-4)
 
 
-def test_a_planner_step_leaves_the_controller_as_it_was(make_environment: Make) -> None:
+def test_environments_that_are_given_one_controller_do_not_disturb_each_other(
+    make_environment: Make, untrained_controller: Path, coarse_physics: PhysicsConfig
+) -> None:
+    shared = Controller.load(untrained_controller)
+    first, second = (CommandEnvironment(load_task("lift_box"), shared, 2, 0, coarse_physics) for _ in range(2))
+    alone = make_environment()
+    actions = _actions(6, 2)
+    expected = [alone.reset(seed=1), *(result.observation for result in _run(alone, actions))]
+    observed = [first.reset(seed=1)]
+    second.reset(seed=2)
+    for action in actions:
+        observed.append(first.step(action).observation)
+        second.step(-action)
+    torch.testing.assert_close(torch.stack(observed), torch.stack(expected), rtol=0, atol=0)
+
+
+def test_what_is_not_finite_is_refused(make_environment: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     environment = make_environment()
     environment.reset(seed=0)
-    before = {name: value.clone() for name, value in environment.controller.actor.state_dict().items()}
-    _run(environment, _actions(5, 2))
-    for name, value in environment.controller.actor.state_dict().items():
-        torch.testing.assert_close(value, before[name], rtol=0, atol=0)
-    assert not any(parameter.requires_grad for parameter in environment.controller.actor.parameters())
+    spoilt = torch.tensor([[0.0], [math.nan]]).expand(2, 9)
+    monkeypatch.setattr(environment.task, "observe_object", lambda measured: spoilt)
+    with pytest.raises(NonFiniteError, match="observation is not finite in 1 of 2 rows: 1"):
+        environment.observe()
 
 
 def test_the_observed_previous_command_is_the_limited_and_feasible_one(make_environment: Make) -> None:

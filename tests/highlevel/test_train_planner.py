@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 import torch
 
+from highlevel.cloning import CloningConfig
 from highlevel.demonstrations import Demonstrations
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.planner import Planner
+from highlevel.policy import PlannerNetwork
 from highlevel.run_folder import BEST_FOLDER, LOG_FILE, STATE_FILE, read_config
 from highlevel.train import main
-from highlevel.trainer import PlannerTrainer
-from highlevel.training_config import PPOConfig
+from highlevel.trainer import DEMONSTRATION_SEED, TRAINING_SEED, PlannerTrainer
+from highlevel.training_config import PlannerTrainingConfig, PPOConfig
 from lowlevel.checks import NonFiniteError
 
 _TINY = [
@@ -74,6 +76,35 @@ def test_a_run_trains_and_resumes(untrained_controller: Path, tmp_path: Path, qu
     assert any(changed)
     for name in ("features_extractor.mean", "features_extractor.scale"):
         torch.testing.assert_close(state["policy"][name], resumed["policy"][name])
+
+
+def test_a_run_resumed_while_it_records_does_not_train_on_the_demonstrations_episodes(
+    untrained_controller: Path, tmp_path: Path, quick_episodes: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    config = PlannerTrainingConfig(
+        controller=untrained_controller,
+        demonstrations=1,
+        num_envs=2,
+        num_threads=1,
+        network=PlannerNetwork(hidden=(16, 16)),
+        cloning=CloningConfig(epochs=1),
+        ppo=PPOConfig(decisions_per_update=16, batch_size=32),
+    )
+    folder.mkdir()
+    PlannerTrainer(config, folder).save()
+    trainer = PlannerTrainer(config, folder)
+    trainer.load()
+
+    def record() -> Demonstrations:
+        observation = trainer.environment.reset(DEMONSTRATION_SEED).numpy()
+        action, value = np.zeros((len(observation), 21), np.float32), np.zeros(len(observation), np.float32)
+        return Demonstrations(observation, action, value, np.zeros(len(observation), np.int64), 1)
+
+    monkeypatch.setattr(trainer, "_demonstrations", record)
+    trainer._imitate()
+    trainer.vec_env.reset()
+    assert trainer.environment.seed == TRAINING_SEED + config.seed
 
 
 def test_bad_input_is_one_sentence(untrained_controller: Path, tmp_path: Path) -> None:

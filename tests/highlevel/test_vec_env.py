@@ -42,6 +42,18 @@ def test_stepping_a_finished_gymnasium_episode_is_refused(
         environment.step(np.zeros(21, np.float32))
 
 
+def test_workers_that_nobody_seeds_run_different_episodes(
+    untrained_controller: Path, coarse_physics: PhysicsConfig
+) -> None:
+    environments = [PlannerEnv("lift_box", untrained_controller, coarse_physics) for _ in range(2)]
+    starts = [environment.reset()[0] for environment in environments]
+    assert not np.array_equal(*starts)
+    numbers = [environments[0].reset()[1]["episode_number"] for _ in range(2)]
+    assert numbers == [1, 2], "without a seed the next episode follows"
+    seeded = [environment.reset(seed=3)[0] for environment in environments]
+    np.testing.assert_array_equal(*seeded)
+
+
 def test_the_vec_env_keeps_stable_baselines_contract(make_environment: Make) -> None:
     environment = make_environment(3)
     vec_env = PlannerVecEnv(environment)

@@ -13,8 +13,9 @@ import torch
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from lowlevel.rotations import yaw_of
 from robots.g1.constants import HAND_BODIES
-from tasks.lift_box.config import LiftBoxConfig, PushConfig, SpawnConfig
+from tasks.lift_box.config import LiftBoxConfig, NoiseConfig, PushConfig, SpawnConfig
 from tasks.lift_box.episode import draw
+from tasks.lift_box.geometry import relative_pose
 from tasks.lift_box.scene import BOX, FORCE_SENSORS, HAND_GEOMS, SUPPORT
 from tasks.lift_box.task import LiftBox
 
@@ -196,6 +197,28 @@ def test_the_observed_box_is_noisy_and_the_noise_repeats(make: Make) -> None:
     assert 0.0 < shift.abs().max() <= noise.position and 0.0 < turn.abs().max() <= noise.angle
     environment.step(environment.action_map.action(environment.command))
     assert not torch.equal(task._pose_noise()[0], shift)
+
+
+def test_the_observed_box_is_off_by_the_noise_and_the_same_way_all_episode(make: Make) -> None:
+    noise = NoiseConfig(position=0.02, angle=0.05)
+    environment, exact = make(16, LiftBoxConfig(noise=noise)), make(16, LiftBoxConfig(noise=NoiseConfig(0.0, 0.0)))
+    errors = []
+    for moment in range(12):
+        if moment == 0:
+            seen, true = environment.reset(seed=3)[:, :9], exact.reset(seed=3)[:, :9]
+        else:
+            still = environment.action_map.action(environment.command)
+            seen, true = environment.step(still).observation[:, :9], exact.step(still).observation[:, :9]
+        errors.append(seen - true)
+    pelvis = torch.cat([exact.measured.robot.base_position, exact.measured.robot.base_quaternion], -1)  # type: ignore[union-attr]
+    position, _ = relative_pose(pelvis, exact.simulation.object_pose(BOX))
+    torch.testing.assert_close(true[:, :3], position)
+    shift, turn = torch.stack(errors)[..., :3], torch.stack(errors)[..., 3:]
+    assert 0.5 * noise.position < shift.abs().max() <= noise.position + 1e-6
+    assert 0.0 < turn.abs().max() < 3 * noise.angle
+    lasting, fresh = shift.mean(dim=0), shift.std(dim=0)
+    assert lasting.std() > 0.2 * noise.position, "half of the error is a bias of the episode"
+    assert (fresh > 0.1 * noise.position).all(), "the other half is new at every decision"
 
 
 def test_the_expert_walks_to_the_box_first(make: Make) -> None:
