@@ -201,8 +201,9 @@ def report_text(figures: dict[str, Figure], machine: dict[str, Any], arguments: 
             "",
             f"{machine['processor']}, {arguments.cores} of {machine['cores_present']} cores; "
             f"{arguments.robots} robots, planner {arguments.planner_robots} robots. Rates are means of "
-            f"{WINDOWS} windows of {arguments.seconds / WINDOWS:g} s with 95 % bootstrap intervals. A "
-            "control step is one robot advanced by 0.02 s; a decision is five of them.",
+            f"{WINDOWS} windows of {arguments.seconds / WINDOWS:g} s, training's of {arguments.updates} updates; "
+            "intervals are bootstrapped over these, which for so few is hardly more than their range. Steps are "
+            "control steps: one robot advanced by 0.02 s. A decision is five of them.",
             "",
             markdown_table(["quantity", "value", "unit", "figure"], rows),
         ]

@@ -4,7 +4,8 @@ command.
 The paper names the planner's output, the command of 21 numbers, but neither its rate nor its bounds (IV-B-2).
 The numbers here are choices. An absolute target behind a rate limiter keeps the task Markov as long as the
 limited command is observed as the previous command, and it is; see
-:class:`highlevel.environment.CommandEnvironment`.
+:class:`highlevel.environment.CommandEnvironment`. Feasibility comes last: near the limits of the posture, clamping can
+move the torso's pitch by more than its rate.
 """
 
 from __future__ import annotations

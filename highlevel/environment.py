@@ -93,6 +93,9 @@ class StepResult:
 class CommandEnvironment:
     """Batched environment with auto-reset: the planner's action in, observations and rewards out.
 
+    The controller's elevation map shows flat ground: what a task puts there, such as a block under a box, is not in
+    it.
+
     Args:
         task: a fresh task, which this environment takes over.
         controller: the frozen controller, or its folder. The environment uses a copy, because a controller
