@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from highlevel.action import ActionConfig
 from highlevel.draws import uniform
 from highlevel.environment import CommandEnvironment
 from highlevel.episodes import Policy
-from highlevel.task import rows
+from highlevel.task import ObservationBlock, rows
 from lowlevel.files import atomic_write
+from lowlevel.plain import from_plain
 
 _NOISE_STREAM = 3
 
@@ -25,9 +28,33 @@ class ExpertError(RuntimeError):
 
 
 @dataclass(frozen=True)
+class Source:
+    """Where demonstrations come from; what their numbers mean depends on it."""
+
+    task: str
+    observation: tuple[ObservationBlock, ...]
+    action: ActionConfig
+    discount: float
+    """Of the returns, per decision."""
+    controller: str
+    """Identity of the controller that the expert used. Its demonstrations may serve another one."""
+
+    def require_like(self, wanted: Source) -> None:
+        """Check that the numbers mean what ``wanted`` needs them to.
+
+        Raises:
+            ValueError: naming the first thing that differs.
+        """
+        for field in fields(self):
+            if field.name != "controller" and getattr(self, field.name) != getattr(wanted, field.name):
+                raise ValueError(f"the demonstrations were recorded with another {field.name}: record them again")
+
+
+@dataclass(frozen=True)
 class Demonstrations:
     """Decisions of successful episodes, one after the other."""
 
+    source: Source
     observation: np.ndarray
     """(T, D) float32"""
     action: np.ndarray
@@ -48,6 +75,7 @@ class Demonstrations:
         """These, then ``other``, whose episodes are renumbered to stay apart."""
         offset = int(self.episode.max(initial=-1)) + 1
         return Demonstrations(
+            self.source,
             np.concatenate([self.observation, other.observation]),
             np.concatenate([self.action, other.action]),
             np.concatenate([self.value, other.value]),
@@ -58,7 +86,8 @@ class Demonstrations:
     def save(self, path: Path) -> None:
         """Write the file; a crash while writing leaves no half of it."""
         arrays = {name: getattr(self, name) for name in ("observation", "action", "value", "episode")}
-        atomic_write(path, lambda file: np.savez_compressed(file, attempts=np.array(self.attempts), **arrays))
+        source, attempts = np.array(json.dumps(asdict(self.source))), np.array(self.attempts)
+        atomic_write(path, lambda file: np.savez_compressed(file, source=source, attempts=attempts, **arrays))
 
     @classmethod
     def load(cls, path: Path) -> Demonstrations:
@@ -66,7 +95,7 @@ class Demonstrations:
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if the file is damaged or holds numbers that are not finite.
+            ValueError: if the file is damaged, of an earlier version, or holds numbers that are not finite.
         """
         if not path.is_file():
             raise FileNotFoundError(f"{path} does not exist: record demonstrations first")
@@ -74,9 +103,13 @@ class Demonstrations:
             raise ValueError(f"{path} does not hold demonstrations: it is damaged, truncated or something else")
         try:
             with np.load(path, allow_pickle=False) as file:
-                loaded = cls(file["observation"], file["action"], file["value"], file["episode"], int(file["attempts"]))
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+                source = from_plain(Source, json.loads(str(file["source"])))
+                attempts = int(file["attempts"])
+                loaded = cls(source, file["observation"], file["action"], file["value"], file["episode"], attempts)
+        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path} does not hold demonstrations: {error}") from error
+        if not len(loaded.observation) == len(loaded.action) == len(loaded.value) == len(loaded.episode):
+            raise ValueError(f"{path} does not hold demonstrations: its arrays differ in length")
         for name in ("observation", "action", "value"):
             if not np.isfinite(getattr(loaded, name)).all():
                 raise ValueError(f"{path} holds numbers in {name!r} that are not finite: record it again")
@@ -90,7 +123,7 @@ def record(
     count: int,
     seed: int,
     noise: float,
-    discount: float,
+    source: Source,
     on_progress: Callable[[int, int], None] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Demonstrations:
@@ -103,7 +136,7 @@ def record(
         seed: seed of the episodes.
         noise: standard deviation of the noise on the executed actions, which shows how the expert recovers
         (DART).
-        discount: of the returns, per decision.
+        source: what is recorded, with the discount of the returns.
         on_progress: told successes and attempts after every episode.
         should_stop: asked after every decision; what has been recorded by then is returned.
 
@@ -138,13 +171,13 @@ def record(
                     f"the expert failed {attempts} times in a row: check the controller with 'evaluate-lowlevel'"
                 )
         observation = result.observation
-    return _pack(finished, attempts, discount, environment)
+    return _pack(finished, attempts, source, environment)
 
 
 def _pack(
     finished: list[tuple[int, list[tuple[Tensor, Tensor, float]]]],
     attempts: int,
-    discount: float,
+    source: Source,
     environment: CommandEnvironment,
 ) -> Demonstrations:
     steps = [step for _, episode in finished for step in episode]
@@ -152,11 +185,12 @@ def _pack(
     for _, episode in finished:
         following, returns = 0.0, []
         for _, _, reward in reversed(episode):
-            following = reward + discount * following
+            following = reward + source.discount * following
             returns.append(following)
         values += reversed(returns)
     width = environment.observation_size
     return Demonstrations(
+        source=source,
         observation=np.array([step[0].numpy() for step in steps], np.float32).reshape(-1, width),
         action=np.array([step[1].numpy() for step in steps], np.float32).reshape(-1, environment.command.shape[1]),
         value=np.array(values, np.float32),

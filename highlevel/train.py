@@ -60,10 +60,11 @@ def _fresh(arguments: Arguments) -> PlannerTrainer:
     require_unused(folder)
     config = replace(arguments.config, controller=find_controller(arguments.config.controller).resolve())
     if config.demonstration_file is not None:
-        # A file that cannot be used is refused before anything is written.
-        Demonstrations.load(config.demonstration_file)
         config = replace(config, demonstration_file=config.demonstration_file.resolve())
     trainer = _trainer(config, folder)
+    if config.demonstration_file is not None:
+        # A file that cannot be used is refused before anything is written.
+        Demonstrations.load(config.demonstration_file).source.require_like(trainer.source)
     create_run(folder, config)
     trainer.save()
     return trainer

@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
 from highlevel.cloning import clone
-from highlevel.demonstrations import Demonstrations, record
+from highlevel.demonstrations import Demonstrations, Source, record
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.episodes import run_episodes, stage_shares, success_rate
 from highlevel.learner import PlannerPPO
@@ -63,6 +64,16 @@ class PlannerTrainer:
         self.episode_seed = TRAINING_SEED + config.seed
         self.environment = self._build_environment(self.episode_seed)
         self.controller_hash = content_hash(config.controller)
+        self.source = Source(
+            config.task,
+            self.environment.blocks,
+            self.environment.task.action,
+            config.ppo.discount,
+            self.controller_hash,
+        )
+        """What this run's demonstrations are recorded with."""
+        self.demonstrated_on = self.controller_hash
+        """Identity of the controller that the demonstrations were recorded on."""
         self._selection_environment: CommandEnvironment | None = None
         self.vec_env = PlannerVecEnv(self.environment)
         self.scale = torch.cat([torch.full((block.size,), block.scale) for block in self.environment.blocks])
@@ -133,7 +144,10 @@ class PlannerTrainer:
         """What to imitate; recording goes on where an interrupted run stopped."""
         config = self.config
         if config.demonstration_file is not None:
-            return Demonstrations.load(config.demonstration_file)
+            loaded = Demonstrations.load(config.demonstration_file)
+            loaded.source.require_like(self.source)
+            self.demonstrated_on = loaded.source.controller
+            return loaded
         path = self.folder / DEMONSTRATIONS_FILE
         done = Demonstrations.load(path) if path.is_file() else None
         wanted = config.demonstrations - (done.count if done else 0)
@@ -150,7 +164,7 @@ class PlannerTrainer:
                 wanted,
                 DEMONSTRATION_SEED + config.seed + (done.attempts if done else 0),
                 config.demonstration_noise,
-                config.ppo.discount,
+                self.source,
                 report,
                 lambda: self._stop_requested,
             )
@@ -194,7 +208,10 @@ class PlannerTrainer:
             controller=Path(self.controller.name),
             demonstration_file=None if recorded is None else Path(recorded.name),
         )
-        provenance = describe_run(named, decisions=self.model.num_timesteps, hours=self.trained_seconds / 3600.0)
+        details: dict[str, Any] = {"decisions": self.model.num_timesteps, "hours": self.trained_seconds / 3600.0}
+        if self.config.imitates:
+            details["demonstrated_on"] = self.demonstrated_on
+        provenance = describe_run(named, **details)
         return Planner(config, PlannerActor.from_policy(self.model.policy, config.hidden), provenance)
 
     def select(self) -> float:
@@ -232,6 +249,7 @@ class PlannerTrainer:
         """
         state = self.model.state_dict() | {
             "controller": self.controller_hash,
+            "demonstrated_on": self.demonstrated_on,
             "phase": self.phase,
             "episode": self.environment.episode,
             "best_rate": self.best_rate,
@@ -253,7 +271,7 @@ class PlannerTrainer:
             self.model.load_state_dict(state)
             self.phase, self.trained_seconds = state["phase"], state["trained_seconds"]
             self.best_rate, self.best_duration = state["best_rate"], state["best_duration"]
-            self.last_selection = state["last_selection"]
+            self.last_selection, self.demonstrated_on = state["last_selection"], state["demonstrated_on"]
             episode, controller = state["episode"], state["controller"]
         except (KeyError, RuntimeError, ValueError) as error:
             reason = str(error).splitlines()[-1].strip()

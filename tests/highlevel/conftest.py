@@ -8,14 +8,24 @@ from pathlib import Path
 import pytest
 import torch
 
-from highlevel.environment import CommandEnvironment, PhysicsConfig
+from highlevel.demonstrations import Source
+from highlevel.environment import ROBOT_BLOCKS, CommandEnvironment, PhysicsConfig
 from highlevel.task import load_task
+from highlevel.training_config import PPOConfig
 
 
 @pytest.fixture
 def coarse_physics() -> PhysicsConfig:
     """Cheap physics for tests of everything but physics."""
     return PhysicsConfig(timestep=0.005, solver_iterations=12, num_threads=1)
+
+
+@pytest.fixture
+def source() -> Source:
+    """Where demonstrations of lift-box come from, by default."""
+    task = load_task("lift_box")
+    blocks = (*task.object_blocks, *ROBOT_BLOCKS, *task.added_blocks)
+    return Source("lift_box", blocks, task.action, PPOConfig().discount, "0" * 16)
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from stable_baselines3 import PPO
 from torch import Tensor
 
 from highlevel.cloning import CloningConfig, clone
-from highlevel.demonstrations import Demonstrations, record
+from highlevel.demonstrations import Demonstrations, Source, record
 from highlevel.environment import CommandEnvironment, StepResult
 from highlevel.policy import PlannerNetwork, policy_arguments
 from highlevel.vec_env import PlannerVecEnv
@@ -49,11 +50,14 @@ def _short_wins(environment: CommandEnvironment, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(environment.task, "step", judge)
 
 
-def test_recorded_returns_are_discounted_sums(make_environment: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recorded_returns_are_discounted_sums(
+    make_environment: Make, monkeypatch: pytest.MonkeyPatch, source: Source
+) -> None:
     environment = make_environment(2)
     _short_wins(environment, monkeypatch, 3)
     expert = _Standing(environment)
-    demonstrations = record(environment, expert, 4, seed=0, noise=0.05, discount=0.5)
+    halving = replace(source, discount=0.5)
+    demonstrations = record(environment, expert, 4, seed=0, noise=0.05, source=halving)
     assert demonstrations.count == 4 and demonstrations.attempts == 4
     assert demonstrations.observation.shape == (12, environment.observation_size)
     # Rewards of 5, 5 and 1: the last option ends at its first control step.
@@ -63,9 +67,10 @@ def test_recorded_returns_are_discounted_sums(make_environment: Make, monkeypatc
     np.testing.assert_allclose(demonstrations.action, np.tile(wanted, (12, 1)), atol=1e-6)
 
 
-def test_demonstrations_survive_a_round_trip_and_damage_is_reported(tmp_path: Path) -> None:
+def test_demonstrations_survive_a_round_trip_and_damage_is_reported(tmp_path: Path, source: Source) -> None:
     rng = np.random.default_rng(0)
     demonstrations = Demonstrations(
+        source,
         rng.normal(size=(6, 4)).astype(np.float32),
         rng.uniform(-1, 1, (6, 21)).astype(np.float32),
         np.arange(6, dtype=np.float32),
@@ -78,7 +83,7 @@ def test_demonstrations_survive_a_round_trip_and_damage_is_reported(tmp_path: Pa
     demonstrations.save(path)
     loaded = Demonstrations.load(path)
     np.testing.assert_array_equal(loaded.action, demonstrations.action)
-    assert loaded.count == 2 and loaded.attempts == 5
+    assert loaded.count == 2 and loaded.attempts == 5 and loaded.source == source
     assert loaded.joined(demonstrations).count == 4
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ValueError, match="does not hold demonstrations"):
@@ -89,7 +94,7 @@ def test_demonstrations_survive_a_round_trip_and_damage_is_reported(tmp_path: Pa
         Demonstrations.load(path)
 
 
-def test_cloning_learns_a_known_policy_and_its_value(make_environment: Make) -> None:
+def test_cloning_learns_a_known_policy_and_its_value(make_environment: Make, source: Source) -> None:
     environment = make_environment(2)
     torch.manual_seed(0)
     size = environment.observation_size
@@ -101,7 +106,7 @@ def test_cloning_learns_a_known_policy_and_its_value(make_environment: Make) -> 
     observation[:, :21] += 2.0 * rng.normal(size=(3000, 21))
     action = np.tanh(observation[:, :21] - 3.0).astype(np.float32)
     demonstrations = Demonstrations(
-        observation, action, observation[:, 0] * 2.0, np.repeat(np.arange(100), 30), attempts=100
+        source, observation, action, observation[:, 0] * 2.0, np.repeat(np.arange(100), 30), attempts=100
     )
     std_before = model.policy.log_std.detach().clone()
     config = CloningConfig(epochs=40, batch_size=256, learning_rate=3e-3, observation_noise=0.0)
@@ -113,7 +118,7 @@ def test_cloning_learns_a_known_policy_and_its_value(make_environment: Make) -> 
     torch.testing.assert_close(normaliser.mean, torch.full((size,), 3.0), atol=0.2, rtol=0)
 
 
-def test_cloning_refuses_foreign_demonstrations(make_environment: Make) -> None:
+def test_cloning_refuses_foreign_demonstrations(make_environment: Make, source: Source) -> None:
     environment = make_environment(2)
     scale = torch.ones(environment.observation_size)
     arguments = policy_arguments(PlannerNetwork(hidden=(8,)), scale)
@@ -121,7 +126,9 @@ def test_cloning_refuses_foreign_demonstrations(make_environment: Make) -> None:
 
     def demonstrations(count: int, width: int) -> Demonstrations:
         zeros = np.zeros((count, width), np.float32)
-        return Demonstrations(zeros, np.zeros((count, 21), np.float32), np.zeros(count, np.float32), np.zeros(count), 1)
+        return Demonstrations(
+            source, zeros, np.zeros((count, 21), np.float32), np.zeros(count, np.float32), np.zeros(count), 1
+        )
 
     with pytest.raises(ValueError, match="record them again"):
         clone(model.policy, demonstrations(4, 3), scale, CloningConfig(), seed=0)

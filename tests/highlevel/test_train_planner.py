@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from highlevel.cloning import CloningConfig
-from highlevel.demonstrations import Demonstrations
+from highlevel.demonstrations import Demonstrations, Source
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.planner import Planner
 from highlevel.policy import PlannerNetwork
@@ -99,7 +99,7 @@ def test_a_run_resumed_while_it_records_does_not_train_on_the_demonstrations_epi
     def record() -> Demonstrations:
         observation = trainer.environment.reset(DEMONSTRATION_SEED).numpy()
         action, value = np.zeros((len(observation), 21), np.float32), np.zeros(len(observation), np.float32)
-        return Demonstrations(observation, action, value, np.zeros(len(observation), np.int64), 1)
+        return Demonstrations(trainer.source, observation, action, value, np.zeros(len(observation), np.int64), 1)
 
     monkeypatch.setattr(trainer, "_demonstrations", record)
     trainer._imitate()
@@ -199,11 +199,13 @@ def test_cloning_comes_first_and_the_actor_waits_for_the_critic(
     tmp_path: Path,
     quick_episodes: None,
     make_environment: Callable[..., CommandEnvironment],
+    source: Source,
 ) -> None:
     environment = make_environment(2)
     rng = np.random.default_rng(0)
     width = environment.observation_size
     demonstrations = Demonstrations(
+        source,
         rng.normal(size=(200, width)).astype(np.float32),
         rng.uniform(-1, 1, (200, 21)).astype(np.float32),
         rng.normal(size=200).astype(np.float32),
@@ -216,7 +218,12 @@ def test_cloning_comes_first_and_the_actor_waits_for_the_critic(
     start += [f"--demonstration-file={recorded}", "--ppo.warm-up-updates=2", "--selection-episodes=1"]
     main([*start, "--name=warming", "--total-decisions=128"])
     main([*start, "--name=learning", "--total-decisions=192"])
-    cloned = Planner.load(tmp_path / "warming" / "cloned").actor.state_dict()
+    loaded = Planner.load(tmp_path / "warming" / "cloned")
+    assert loaded.provenance["demonstrated_on"] == source.controller != loaded.config.controller
+    with pytest.raises(SystemExit, match="recorded with another discount"):
+        main([*start, "--name=other", "--ppo.discount=0.9"])
+    assert not (tmp_path / "other").exists()
+    cloned = loaded.actor.state_dict()
     warm = torch.load(tmp_path / "warming" / STATE_FILE, weights_only=True)["policy"]
     late = torch.load(tmp_path / "learning" / STATE_FILE, weights_only=True)["policy"]
     torch.testing.assert_close(warm["action_net.weight"], cloned["output.weight"], rtol=0, atol=0)
