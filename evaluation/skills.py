@@ -22,14 +22,13 @@ from lowlevel.measures import height_error, torso_error
 from lowlevel.terrain import TerrainConfig
 from robots.g1.constants import ARM_JOINTS, NUM_JOINTS, TORSO_BODY
 from robots.g1.kinematics import PALM_FRAMES, Kinematics
-from robots.g1.mirror import ARMS_MIRROR
+from robots.g1.mirror import both_arms
 
 FLAT = TerrainConfig(tiles=("flat",), tile_size=TILE_SIZE)
 EPISODES = 200
 """Episodes of each test."""
 
-_LEFT_HOLDING_ARM = np.array([-1.19, 0.25, 0.17, 0.43, -0.13, 0.45, 0.05, *(0.0,) * 7])
-HOLDING_ARMS = _LEFT_HOLDING_ARM + ARMS_MIRROR(_LEFT_HOLDING_ARM)
+HOLDING_ARMS = both_arms((-1.19, 0.25, 0.17, 0.43, -0.13, 0.45, 0.05))
 """Arm joints (14,) [rad] that hold a box before the chest: palms facing each other, 0.3 m apart, elbows bent. With the
 elbows closer to the body the forearms would lean on the thighs in the deep bend."""
 BOX_LOAD = HandLoad(outward=15.0, downward=5.0, begin=1.0)

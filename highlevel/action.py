@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, TORSO, VELOCITY, is_walking
+from robots.g1.mirror import both_arms
 
 _PER_ARM = tuple[float, float, float, float, float, float, float]
 
@@ -62,22 +63,16 @@ class ActionMap:
         control_period: of the controller [s].
     """
 
-    def __init__(self, config: ActionConfig, control_period: float, device: torch.device | str = "cpu") -> None:
+    def __init__(self, config: ActionConfig, control_period: float) -> None:
         self.config = config
-        arm_sign = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-        center, half = torch.tensor(config.arm_center), torch.tensor(config.arm_half_range)
-        arm_center = torch.cat([center, center * arm_sign])
-        arm_half = torch.cat([half, half])
+        arm_center = torch.tensor(both_arms(config.arm_center), dtype=torch.float32)
+        arm_half = torch.tensor(config.arm_half_range).repeat(2)
         torso_lower = (-config.roll, config.pitch[0], -config.yaw)
         torso_upper = (config.roll, config.pitch[1], config.yaw)
-        self.lower = _assemble(
-            config.velocity_lower, config.height[0], torso_lower, (arm_center - arm_half).tolist(), device
-        )
-        self.upper = _assemble(
-            config.velocity_upper, config.height[1], torso_upper, (arm_center + arm_half).tolist(), device
-        )
+        self.lower = _assemble(config.velocity_lower, config.height[0], torso_lower, (arm_center - arm_half).tolist())
+        self.upper = _assemble(config.velocity_upper, config.height[1], torso_upper, (arm_center + arm_half).tolist())
         torso_rate = (config.roll_yaw_rate, config.pitch_rate, config.roll_yaw_rate)
-        rate = _assemble(config.velocity_rate, config.height_rate, torso_rate, (config.arm_rate,) * 14, device)
+        rate = _assemble(config.velocity_rate, config.height_rate, torso_rate, (config.arm_rate,) * 14)
         self.largest_change = rate * config.decision_steps * control_period
         """Largest change of the command in one decision (21,)."""
 
@@ -115,11 +110,10 @@ def _assemble(
     height: float,
     torso: tuple[float, float, float],
     arms: list[float] | tuple[float, ...],
-    device: torch.device | str,
 ) -> Tensor:
-    command = torch.zeros(COMMAND_SIZE, device=device)
-    command[VELOCITY] = torch.tensor(velocity, device=device)
+    command = torch.zeros(COMMAND_SIZE)
+    command[VELOCITY] = torch.tensor(velocity)
     command[HEIGHT] = height
-    command[TORSO] = torch.tensor(torso, device=device)
-    command[ARMS] = torch.tensor(arms, device=device)
+    command[TORSO] = torch.tensor(torso)
+    command[ARMS] = torch.tensor(arms)
     return command

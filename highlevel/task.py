@@ -200,6 +200,6 @@ def environment_id(name: str) -> str:
     return f"pilot/{''.join(word.capitalize() for word in name.split('_'))}-v0"
 
 
-def rows(count: int, device: torch.device | str = "cpu") -> Tensor:
+def rows(count: int) -> Tensor:
     """Indices of all of ``count`` robots."""
-    return torch.arange(count, device=device)
+    return torch.arange(count)

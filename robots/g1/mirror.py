@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,3 +75,9 @@ LOWER_MIRROR = _joint_mirror(JOINT_NAMES[LOWER_JOINTS])
 """Mirror of the 15 leg and waist joints."""
 ARMS_MIRROR = _joint_mirror(JOINT_NAMES[ARM_JOINTS])
 """Mirror of the 14 arm joints."""
+
+
+def both_arms(left: Sequence[float]) -> np.ndarray:
+    """Arm joints (14,) whose left seven are ``left`` and whose right seven are its mirror image."""
+    alone = np.concatenate([left, np.zeros(len(left))])
+    return alone + ARMS_MIRROR(alone)

@@ -25,6 +25,7 @@ from lowlevel.rotations import (
     yaw_of,
 )
 from robots.g1.constants import ARM_JOINTS, PALM_HALF_THICKNESS, SOLE_CENTER, WAIST_JOINTS
+from robots.g1.mirror import both_arms
 from tasks.lift_box.arms import ArmKinematics, palm_rotation
 from tasks.lift_box.expert_config import CLOSE, DESCEND, HOLD, LIFT, STOP, WALK, ExpertConfig
 from tasks.lift_box.geometry import Situation
@@ -293,9 +294,8 @@ class LiftBoxExpert:
 
     def _rest_posture(self, torso_pitch: Tensor) -> Tensor:
         """Arms hanging ahead of the torso (N, 14), hands half open to the box."""
-        left = torch.tensor([-0.2, 0.2, 0.15, 0.5, -0.1, 0.2, 0.0])
-        sign = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-        rest = torch.cat([left, left * sign]).repeat(len(torso_pitch), 1)
+        rest = torch.tensor(both_arms((-0.2, 0.2, 0.15, 0.5, -0.1, 0.2, 0.0)), dtype=torch.float32)
+        rest = rest.repeat(len(torso_pitch), 1)
         rest[:, 0] -= 0.8 * torso_pitch
         rest[:, 7] -= 0.8 * torso_pitch
         return rest

@@ -17,8 +17,8 @@ def relative_pose(frame: Tensor, thing: Tensor) -> tuple[Tensor, Tensor]:
     return position, multiply(conjugate(frame[:, 3:]), thing[:, 3:])
 
 
-def six_numbers(quaternion: Tensor) -> Tensor:
-    """First two columns of the rotation matrix (N, 6): a continuous description of an attitude."""
+def rotation_6d(quaternion: Tensor) -> Tensor:
+    """First two columns of the rotation matrix (N, 6): a continuous attitude (Zhou et al., CVPR 2019)."""
     columns = []
     for axis in range(2):
         unit = torch.zeros(*quaternion.shape[:-1], 3)

@@ -19,7 +19,7 @@ from lowlevel.rotations import from_roll_pitch_yaw, multiply
 from lowlevel.simulation import BatchSimulation
 from tasks.lift_box.config import LiftBoxConfig
 from tasks.lift_box.episode import Episode, draw
-from tasks.lift_box.geometry import Situation, observe_situation, relative_pose, six_numbers
+from tasks.lift_box.geometry import Situation, observe_situation, relative_pose, rotation_6d
 from tasks.lift_box.reward import costs, potential
 from tasks.lift_box.scene import BOX, FORCE_SENSORS, BoxProperties, add_box_scene
 from tasks.lift_box.stages import HOLD, STAGES, Progress, advance, failure_name
@@ -161,7 +161,7 @@ class LiftBox(Task):
         position, quaternion = relative_pose(pelvis, self._simulation.object_pose(BOX))
         shift, turn = self._pose_noise()
         quaternion = multiply(quaternion, from_roll_pitch_yaw(turn))
-        return torch.cat([position + shift, six_numbers(quaternion)], -1)
+        return torch.cat([position + shift, rotation_6d(quaternion)], -1)
 
     def observe_additions(self, measured: Measurement, time_left: Tensor) -> Tensor:
         situation = self.look(measured)

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robots.g1.constants import ARM_JOINTS, JOINT_NAMES, LOWER_JOINTS, SIDES
+from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, JOINT_NAMES, LOWER_JOINTS, SIDES
 from robots.g1.kinematics import FRAMES, Kinematics, build_model
 from robots.g1.mirror import (
     ARMS_MIRROR,
@@ -20,6 +20,7 @@ from robots.g1.mirror import (
     LOWER_MIRROR,
     VECTOR,
     Mirror,
+    both_arms,
     concatenate,
     signs,
 )
@@ -89,6 +90,14 @@ def test_left_knee_and_waist_by_hand() -> None:
     assert mirrored["right_hip_roll_joint"] == -2.0
     assert mirrored["waist_yaw_joint"] == -3.0
     assert sum(value != 0.0 for value in mirrored.values()) == 3
+
+
+def test_both_arms_are_their_own_mirror_image() -> None:
+    default = DEFAULT_POSITION[ARM_JOINTS]
+    np.testing.assert_array_equal(both_arms(default[:7]), default)
+    arms = both_arms((0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7))
+    np.testing.assert_array_equal(arms[7:], [0.1, -0.2, -0.3, 0.4, -0.5, 0.6, -0.7])
+    np.testing.assert_array_equal(ARMS_MIRROR(arms), arms)
 
 
 def test_mismatched_mirror_is_refused() -> None:

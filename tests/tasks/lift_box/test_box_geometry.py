@@ -11,7 +11,7 @@ from lowlevel.measures import Measurement
 from lowlevel.rotations import from_roll_pitch_yaw
 from lowlevel.simulation import RobotState
 from robots.g1.kinematics import placement, pose_in_pelvis
-from tasks.lift_box.geometry import observe_situation, relative_pose, six_numbers
+from tasks.lift_box.geometry import observe_situation, relative_pose, rotation_6d
 
 
 def _random_pose(generator: torch.Generator, count: int) -> Tensor:
@@ -23,7 +23,7 @@ def test_the_relative_pose_is_pinocchios_act_inv() -> None:
     generator = torch.Generator().manual_seed(0)
     pelvis, box = _random_pose(generator, 20), _random_pose(generator, 20)
     position, quaternion = relative_pose(pelvis, box)
-    six = six_numbers(quaternion)
+    six = rotation_6d(quaternion)
     for i in range(20):
         expected = pose_in_pelvis(
             placement(pelvis[i, :3].double().numpy(), pelvis[i, 3:].double().numpy()),
