@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PLANNER ?= checkpoints/highlevel/lift-box
 OUTPUT ?= reports/demo
+# A box of 1.7 kg on the floor; any other number is another box
+EPISODE ?= 4
 
 .PHONY: setup demo test format clean
 
@@ -18,7 +20,7 @@ $(VENV)/.ready: pyproject.toml
 	touch $@
 
 demo: setup
-	$(BIN)/run-demo --task lift_box --planner $(PLANNER) --output $(OUTPUT)
+	$(BIN)/run-demo --task lift_box --planner $(PLANNER) --episode $(EPISODE) --output $(OUTPUT)
 
 test: setup
 	$(BIN)/ruff check .

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -53,6 +55,27 @@ def test_every_option_that_is_shown_exists(capsys: pytest.CaptureFixture[str]) -
 
 def _options(text: str) -> set[str]:
     return set(re.findall(r"(?<![\w-])--[a-z][a-z0-9.-]*", text))
+
+
+@pytest.mark.parametrize("report", ["lift-box-planner", "lift-box-scripted"])
+def test_success_rates_are_those_of_the_reports(report: str) -> None:
+    figures = json.loads((ROOT / "docs" / "reports" / report / "metrics.json").read_text())["figures"]
+    shares = (_share(figures[name]) for name in ("full", "lift_up", "fall_rate"))
+    assert f"| {' | '.join(shares)} | {figures['success_time']['value']:.1f} s |" in README
+
+
+def test_tracking_figures_are_those_of_the_report() -> None:
+    figures = json.loads((ROOT / "docs" / "reports" / "lowlevel-simple" / "metrics.json").read_text())["figures"]
+    for name, digits in (("E_v", 3), ("E_omega", 3), ("E_h", 4), ("E_arm", 3)):
+        low, high = figures[name]["ci95"]
+        assert f"| {figures[name]['value']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}] |" in README, name
+    for name in ("fall_rate", "deep_bend_success", "stop_rest", "push_success"):
+        assert f"| {_share(figures[name])} |" in README, name
+
+
+def _share(figure: dict[str, Any]) -> str:
+    low, high = figure["ci95"]
+    return f"{100 * figure['value']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def test_every_file_that_is_linked_exists() -> None:
