@@ -89,16 +89,25 @@ def plot_heat_map(
     title: str,
     decimals: int = 3,
     limits: tuple[float, float] | None = None,
+    axes: tuple[str, str] = ("", ""),
+    colors: str = "coolwarm",
 ) -> None:
-    """``values`` (rows, columns) with their numbers written in; NaN stays blank. ``limits`` of the colours."""
+    """``values`` (rows, columns) with their numbers written in; NaN stays blank.
+
+    ``limits`` are those of the ``colors``, Matplotlib's name of a map; ``axes`` say what rows and columns are.
+    """
     low, high = (None, None) if limits is None else limits
     canvas, axis = pyplot.subplots(figsize=(1.6 + 1.1 * len(columns), 1.4 + 0.5 * len(rows)))
-    image = axis.imshow(values, cmap="coolwarm", aspect="auto", vmin=low, vmax=high)
+    image = axis.imshow(values, cmap=colors, aspect="auto", vmin=low, vmax=high)
     axis.set_xticks(range(len(columns)), columns)
     axis.set_yticks(range(len(rows)), rows)
     for (row, column), value in np.ndenumerate(values):
         if np.isfinite(value):
-            axis.text(column, row, f"{value:.{decimals}f}", ha="center", va="center", fontsize=9)
+            is_dark = np.mean(image.cmap(image.norm(value))[:3]) < 0.45
+            ink = "white" if is_dark else "black"
+            axis.text(column, row, f"{value:.{decimals}f}", ha="center", va="center", fontsize=9, color=ink)
+    axis.set_ylabel(axes[0])
+    axis.set_xlabel(axes[1])
     axis.set_title(title, fontsize=10)
     canvas.colorbar(image)
     _save(canvas, path)

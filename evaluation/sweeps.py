@@ -70,9 +70,18 @@ def write_plots(folder: Path, results: list[SweepResult]) -> None:
     """One heat map [%] per sweep."""
     for result in results:
         values = np.array([[100.0 * (figure.value or 0.0) for figure in row] for row in result.cells])
-        title = f"full success [%] over {_axes(result.sweep)}"
-        labels = result.row_labels, result.column_labels
-        plot_heat_map(folder / _picture(result), values, *labels, title, decimals=0, limits=(0.0, 100.0))
+        columns = result.sweep.columns
+        plot_heat_map(
+            folder / _picture(result),
+            values,
+            result.row_labels,
+            result.column_labels,
+            "full success [%]",
+            decimals=0,
+            limits=(0.0, 100.0),
+            axes=(result.sweep.rows.label, "" if columns is None else columns.label),
+            colors="YlGn",
+        )
 
 
 def report_lines(results: list[SweepResult]) -> list[str]:
