@@ -35,8 +35,6 @@ from lowlevel.measures import Measurement
 from lowlevel.progress import ProgressReport
 
 RECORDING_FILE, OUTCOME_FILE, STRIP_FILE = "episode.rrd", "outcome.json", "stages.png"
-STRIP_SIZE = (240, 320)
-"""Width and height of each stage's picture in the strip [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +208,7 @@ def draw(twin: VisualTwin, story: Story, output: Path) -> list[str]:
                     stages.append(pixels)
         if stages:
             names.insert(0, STRIP_FILE)
-            save_picture(output / STRIP_FILE, film_strip(stages, *STRIP_SIZE))
+            save_picture(output / STRIP_FILE, film_strip(stages))
     except NoOpenGLError as error:
         print(error)
     return names

@@ -13,7 +13,7 @@ import tyro
 
 from evaluation.harness import Arena, constant
 from evaluation.pictures import Painter, film_strip, following_camera, save_picture
-from evaluation.reports import run_command
+from evaluation.reports import check_output, run_command
 from evaluation.skills import HOLDING_ARMS
 from evaluation.visuals import VisualTwin
 from highlevel.registration import find_controller
@@ -21,8 +21,6 @@ from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.controller import Controller
 from lowlevel.terrain import TerrainConfig
 
-SIZE = (240, 320)
-"""Width and height of each pose's picture [pixels]."""
 DURATION = 5.0
 """How long a command lasts until the picture is taken [s]."""
 
@@ -77,8 +75,12 @@ def main(arguments: list[str] | None = None) -> None:
 def _run(arguments: Arguments) -> None:
     torch.set_num_threads(1)
     folder = find_controller(arguments.controller)
+    if arguments.output.is_dir():
+        raise ValueError(f"--output is the picture, but {arguments.output} is a folder: name a file in it")
+    check_output(arguments.output.parent)
+    pixels = draw(Controller.load(folder), arguments.seed)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    save_picture(arguments.output, draw(Controller.load(folder), arguments.seed))
+    save_picture(arguments.output, pixels)
     print(f"{arguments.output}: {', '.join(pose.name for pose in POSES)}")
 
 
@@ -103,7 +105,7 @@ def draw(controller: Controller, seed: int) -> np.ndarray:
             twin.follow(arena.simulation, row)
             mujoco.mj_forward(twin.model, twin.data)
             pictures.append(painter.draw(twin.data, following_camera(twin.model, twin.data)))
-    return film_strip(pictures, *SIZE)
+    return film_strip(pictures)
 
 
 def _command(pose: Pose, neutral: torch.Tensor) -> torch.Tensor:

@@ -146,8 +146,10 @@ def following_camera(
     return camera
 
 
-def film_strip(pictures: Sequence[np.ndarray], width: int, height: int) -> np.ndarray:
+def film_strip(pictures: Sequence[np.ndarray], width: int = 240, height: int = 320) -> np.ndarray:
     """``pictures`` (H, W, 3) next to each other (height, len * width, 3), each cut to its middle and scaled down.
+
+    ``width`` and ``height`` are those of each part [pixels].
 
     Raises:
         ValueError: if there are none, or one is smaller than what it is to become.

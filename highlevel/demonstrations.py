@@ -107,7 +107,8 @@ class Demonstrations:
                 attempts = int(file["attempts"])
                 loaded = cls(source, file["observation"], file["action"], file["value"], file["episode"], attempts)
         except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} does not hold demonstrations: {error}") from error
+            reason = f"{error}, so that it is damaged or of an earlier version: record it again"
+            raise ValueError(f"{path} does not hold demonstrations: {reason}") from error
         if not len(loaded.observation) == len(loaded.action) == len(loaded.value) == len(loaded.episode):
             raise ValueError(f"{path} does not hold demonstrations: its arrays differ in length")
         for name in ("observation", "action", "value"):
