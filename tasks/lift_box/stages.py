@@ -93,16 +93,24 @@ def advance(
         & (situation.yaw_error.abs() < config.approach_yaw)
         & (situation.speed < config.approach_speed),
         reached=(situation.palm_distance < config.reach_distance).all(dim=1),
-        grasped=progress.contact_time >= config.contact_time,
+        grasped=lasted(progress.contact_time, config.contact_time, period),
         lifted=both & (clearance > config.lift_clearance),
         upright=upright,
-        held=progress.hold_time >= config.hold_time,
+        held=lasted(progress.hold_time, config.hold_time, period),
     )
     passed = torch.stack([getattr(conditions, item.name) for item in fields(conditions)], dim=1)
     following = progress.stage.clamp(max=len(STAGES) - 1)
     progress.stage = progress.stage + (passed.gather(1, following[:, None])[:, 0] & (progress.stage < len(STAGES)))
     progress.lost_time = torch.where((progress.stage >= LIFT) & ~both, progress.lost_time + period, 0.0)
     return conditions
+
+
+def lasted(time: Tensor, wanted: float, period: float) -> Tensor:
+    """Whether ``time`` (N,) [s], a sum of control ``period`` s [s], has reached ``wanted`` [s] (N,).
+
+    Half a period decides, because a float32 sum may end on either side of the number that it stands for.
+    """
+    return time > wanted - 0.5 * period
 
 
 def failure_name(stage: int, fallen: bool, dropped: bool) -> str:

@@ -22,7 +22,7 @@ from tasks.lift_box.episode import Episode, draw
 from tasks.lift_box.geometry import Situation, observe_situation, relative_pose, rotation_6d
 from tasks.lift_box.reward import costs, potential
 from tasks.lift_box.scene import BOX, FORCE_SENSORS, BoxProperties, add_box_scene
-from tasks.lift_box.stages import HOLD, STAGES, Progress, advance, failure_name
+from tasks.lift_box.stages import HOLD, STAGES, Progress, advance, failure_name, lasted
 from tasks.lift_box.sweeps import SWEEPS
 
 _NOISE_STREAM, _PUSH_STREAM = 2, 4
@@ -137,7 +137,7 @@ class LiftBox(Task):
         return observe_situation(measured, self._simulation.object_pose(BOX), self.episode.size, force)
 
     def _dropped(self) -> Tensor:
-        return self.progress.lost_time >= self.config.stages.drop_time
+        return lasted(self.progress.lost_time, self.config.stages.drop_time, self._simulation.control_period)
 
     @property
     def stage(self) -> Tensor:

@@ -85,6 +85,21 @@ def test_contact_needs_both_palms_for_a_while_and_has_hysteresis() -> None:
     assert not fresh.touching.any(), "3 N do not begin one"
 
 
+def test_times_are_counted_in_control_steps() -> None:
+    config, progress = StageConfig(), Progress.empty(1)
+    _run(progress, _REACHED, 0.1)
+    _run(progress, _SQUEEZED, config.contact_time - _PERIOD)
+    assert progress.stage.item() < GRASP
+    _run(progress, _SQUEEZED, _PERIOD)
+    assert progress.stage.item() == GRASP
+    progress = Progress.empty(1)
+    _run(progress, _LIFTED, 0.6)
+    _run(progress, _UPRIGHT, config.hold_time - _PERIOD)
+    assert progress.stage.item() < HOLD
+    _run(progress, _UPRIGHT, _PERIOD)
+    assert progress.stage.item() == HOLD
+
+
 def test_losing_a_lifted_box_is_noticed_and_holding_starts_over() -> None:
     progress = Progress.empty(1)
     _run(progress, _LIFTED, 0.6)
