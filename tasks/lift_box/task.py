@@ -15,7 +15,7 @@ from highlevel.action import ActionConfig
 from highlevel.draws import uniform
 from highlevel.task import Decision, ObservationBlock, Outcome, Start, Task, rows
 from lowlevel.measures import Measurement
-from lowlevel.rotations import from_roll_pitch_yaw, multiply
+from lowlevel.rotations import from_roll_pitch_yaw, multiply, rotate
 from lowlevel.simulation import BatchSimulation
 from tasks.lift_box.config import LiftBoxConfig
 from tasks.lift_box.episode import Episode, draw
@@ -132,9 +132,14 @@ class LiftBox(Task):
         return self._number * 100_000 + self._control_steps
 
     def look(self, measured: Measurement) -> Situation:
+        """The situation as it is."""
+        return self._look_at(measured, self._simulation.object_pose(BOX))
+
+    def _look_at(self, measured: Measurement, box_pose: Tensor) -> Situation:
+        """The situation, were the box at the world pose ``box_pose`` (N, 7)."""
         # The force that each hand exerts on the box; the tests pin the sign.
         force = torch.stack([self._simulation.sensor(name) for name in FORCE_SENSORS], dim=1)
-        return observe_situation(measured, self._simulation.object_pose(BOX), self.episode.size, force)
+        return observe_situation(measured, box_pose, self.episode.size, force)
 
     def _dropped(self) -> Tensor:
         return lasted(self.progress.lost_time, self.config.stages.drop_time, self._simulation.control_period)
@@ -158,18 +163,15 @@ class LiftBox(Task):
     def observe_object(self, measured: Measurement) -> Tensor:
         robot = measured.robot
         pelvis = torch.cat([robot.base_position, robot.base_quaternion], -1)
-        position, quaternion = relative_pose(pelvis, self._simulation.object_pose(BOX))
-        shift, turn = self._pose_noise()
-        quaternion = multiply(quaternion, from_roll_pitch_yaw(turn))
-        return torch.cat([position + shift, rotation_6d(quaternion)], -1)
+        position, quaternion = relative_pose(pelvis, self._observed_box(measured))
+        return torch.cat([position, rotation_6d(quaternion)], -1)
 
     def observe_additions(self, measured: Measurement, time_left: Tensor) -> Tensor:
-        situation = self.look(measured)
         current = self.progress.stage.clamp(max=len(STAGES) - 1)
         return torch.cat(
             [
                 self.episode.size,
-                (situation.palm_offset + self._pose_noise()[0][:, None]).flatten(1),
+                self._look_at(measured, self._observed_box(measured)).palm_offset.flatten(1),
                 self.progress.touching.float(),
                 torch.nn.functional.one_hot(current, len(STAGES)).float(),
                 time_left[:, None],
@@ -178,8 +180,16 @@ class LiftBox(Task):
             dim=-1,
         )
 
+    def _observed_box(self, measured: Measurement) -> Tensor:
+        """World pose (N, 7) at which the robot sees the box: off by the noise, in the axes of its pelvis."""
+        true = self._simulation.object_pose(BOX)
+        shift, turn = self._pose_noise()
+        position = true[:, :3] + rotate(measured.robot.base_quaternion, shift)
+        return torch.cat([position, multiply(true[:, 3:], from_roll_pitch_yaw(turn))], -1)
+
     def _pose_noise(self) -> tuple[Tensor, Tensor]:
-        """Errors of the observed box position [m] and attitude [rad], each (N, 3); new at every decision."""
+        """Errors of the observed box position in the pelvis frame [m], and of its attitude in its own [rad], each
+        (N, 3); new at every decision."""
         noise = self.config.noise
         fresh = 2.0 * uniform(self._seed, self._moment(), _NOISE_STREAM, 6) - 1.0
         shift = 0.5 * noise.position * (fresh[:, :3] + self.episode.position_bias)

@@ -221,6 +221,30 @@ def test_the_observed_box_is_off_by_the_noise_and_the_same_way_all_episode(make:
     assert (fresh > 0.1 * noise.position).all(), "the other half is new at every decision"
 
 
+def test_palms_are_seen_relative_to_the_box_that_is_seen(make: Make) -> None:
+    environment = make(8, LiftBoxConfig(noise=NoiseConfig(position=0.1, angle=0.5)))
+    observation = environment.reset(seed=3)
+    measured, size = environment.measured, _lift_box(environment).episode.size
+    assert measured is not None
+    robot, names = measured.robot, [block.name for block in environment.blocks]
+    begin = sum(block.size for block in environment.blocks[: names.index("palm_to_face")])
+    for robot_number, row in enumerate(observation.numpy()):
+        columns = row[3:9].reshape(2, 3)
+        seen = np.column_stack([*columns, np.cross(*columns)])
+        pelvis = np.empty(9)
+        mujoco.mju_quat2Mat(pelvis, robot.base_quaternion[robot_number].double().numpy())
+        heading = float(measured.heading[robot_number])
+        to_heading = np.array(
+            [[np.cos(heading), np.sin(heading), 0], [-np.sin(heading), np.cos(heading), 0], [0, 0, 1]]
+        )
+        for palm, side in enumerate((1.0, -1.0)):
+            face = row[:3] + seen @ [0.0, side * 0.5 * float(size[robot_number, 1]), 0.0]
+            world = pelvis.reshape(3, 3) @ face + robot.base_position[robot_number].numpy()
+            offset = to_heading @ (world - robot.palm_position[robot_number, palm].numpy())
+            at = begin + 3 * palm
+            np.testing.assert_allclose(row[at : at + 3], offset, atol=1e-5)
+
+
 def test_the_expert_walks_to_the_box_first(make: Make) -> None:
     environment = make(6)
     environment.reset(seed=0)
