@@ -21,6 +21,8 @@ from lowlevel.files import atomic_write
 from lowlevel.plain import from_plain
 
 _NOISE_STREAM = 3
+_Step = tuple[Tensor, Tensor, float]
+"""Observation, action and reward of one decision."""
 
 
 class ExpertError(RuntimeError):
@@ -128,7 +130,7 @@ def record(
     on_progress: Callable[[int, int], None] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Demonstrations:
-    """Run the expert until ``count`` episodes have succeeded.
+    """Run the expert and keep the first ``count`` episodes that succeed, by number.
 
     Args:
         environment: where.
@@ -141,15 +143,19 @@ def record(
         on_progress: told successes and attempts after every episode.
         should_stop: asked after every decision; what has been recorded by then is returned.
 
+    Returns:
+        the episodes in order; the same ones for every number of robots.
+
     Raises:
         ExpertError: if the expert does not succeed once in 4 ``count`` + 100 attempts.
     """
     observation = environment.reset(seed)
     expert.reset(rows(environment.num_envs))
-    running: list[list[tuple[Tensor, Tensor, float]]] = [[] for _ in range(environment.num_envs)]
-    finished: list[tuple[int, list[tuple[Tensor, Tensor, float]]]] = []
-    attempts = 0
-    while len(finished) < count and not should_stop():
+    running: list[list[_Step]] = [[] for _ in range(environment.num_envs)]
+    successes: dict[int, list[_Step]] = {}
+    ended: set[int] = set()
+    leading = 0  # Episodes 0 to this - 1 have all ended: later ones that were quicker must not displace them.
+    while sum(number < leading for number in successes) < count and not should_stop():
         action = expert.act(observation)
         moment = environment.episode * 10_000 + environment.decisions
         # Uniform numbers of the wanted standard deviation.
@@ -159,24 +165,29 @@ def record(
         for robot, steps in enumerate(running):
             steps.append((observation[robot], action[robot], rewards[robot]))
             if done[robot]:
-                attempts += 1
+                number = int(result.episode[robot])
+                ended.add(number)
                 if result.success[robot]:
-                    finished.append((int(result.episode[robot]), steps))
+                    successes[number] = steps
                 running[robot] = []
         if any(done):
             expert.reset(torch.nonzero(result.done)[:, 0])
+            while leading in ended:
+                leading += 1
             if on_progress is not None:
-                on_progress(len(finished), attempts)
-            if not finished and attempts > 4 * count + 100:
+                on_progress(min(len(successes), count), len(ended))
+            if not successes and len(ended) > 4 * count + 100:
                 raise ExpertError(
-                    f"the expert failed {attempts} times in a row: check the controller with 'evaluate-lowlevel'"
+                    f"the expert failed {len(ended)} times in a row: check the controller with 'evaluate-lowlevel'"
                 )
         observation = result.observation
-    return _pack(finished, attempts, source, environment)
+    kept = sorted(successes)[:count]
+    attempts = kept[-1] + 1 if len(kept) == count else len(ended)
+    return _pack([(number, successes[number]) for number in kept], attempts, source, environment)
 
 
 def _pack(
-    finished: list[tuple[int, list[tuple[Tensor, Tensor, float]]]],
+    finished: list[tuple[int, list[_Step]]],
     attempts: int,
     source: Source,
     environment: CommandEnvironment,

@@ -136,6 +136,27 @@ def test_cloning_refuses_foreign_demonstrations(make_environment: Make, source: 
         clone(model.policy, demonstrations(0, len(scale)), scale, CloningConfig(), seed=0)
 
 
+def test_slow_episodes_are_not_displaced_by_quick_ones(
+    make_environment: Make, monkeypatch: pytest.MonkeyPatch, source: Source
+) -> None:
+    from highlevel.task import Decision, Outcome
+
+    for robots in (1, 3):
+        environment = make_environment(robots)
+
+        def judge(measured: Measurement, decision: Decision, environment: CommandEnvironment = environment) -> Outcome:
+            # Episode 0 takes six decisions, episode 3 fails, and the others take two.
+            number, over = environment.episode, environment.decisions >= 2
+            over = over & ((number > 0) | (environment.decisions >= 6))
+            return Outcome(torch.ones(environment.num_envs), over & (number != 3), over & (number == 3))
+
+        monkeypatch.setattr(environment.task, "step", judge)
+        recorded = record(environment, _Standing(environment), 4, seed=0, noise=0.0, source=source)
+        numbers, lengths = np.unique(recorded.episode, return_counts=True)
+        assert numbers.tolist() == [0, 1, 2, 4] and lengths.tolist() == [6, 2, 2, 2]
+        assert recorded.attempts == 5
+
+
 def test_episode_records_do_not_depend_on_the_number_of_robots(
     make_environment: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
