@@ -65,10 +65,9 @@ class StepResult:
     """After resets (N, D)."""
     reward: Tensor
     """Sum over the control steps of the option (N,)."""
-    terminated: Tensor
-    """Success, failure or fall (N,)."""
-    truncated: Tensor
-    """Out of time (N,)."""
+    done: Tensor
+    """Episodes that ended (N,): success, failure, fall or out of time. The time left is observed, so that running out
+    of it ends an episode like a failure and does not truncate it (Pardo et al., ICML 2018)."""
     success: Tensor
     """(N,)"""
     fallen: Tensor
@@ -83,11 +82,6 @@ class StepResult:
     """Number of the episode that this decision belongs to (N,)."""
     duration: Tensor
     """Time since that episode began (N,) [s]."""
-
-    @property
-    def done(self) -> Tensor:
-        """Episodes that ended (N,)."""
-        return self.terminated | self.truncated
 
 
 class CommandEnvironment:
@@ -252,16 +246,14 @@ class CommandEnvironment:
                 close(now)
                 explain(now & ~success)
                 ended |= now
-        terminated = ended.clone()
         close(~ended)
-        truncated = ~ended & (self.decisions >= self.max_decisions)
-        if bool(truncated.any()):
-            explain(truncated)
+        late = ~ended & (self.decisions >= self.max_decisions)
+        if bool(late.any()):
+            explain(late)
         result = StepResult(
             observation=observation,
             reward=reward,
-            terminated=terminated,
-            truncated=truncated,
+            done=ended | late,
             success=success,
             fallen=fallen,
             final_observation=observation,

@@ -64,7 +64,7 @@ class PlannerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return observation[0].numpy(), {"episode_number": int(self.environment.episode[0])}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One decision of 0.1 s."""
+        """One decision of 0.1 s. Nothing is ever truncated: running out of time, which is observed, terminates."""
         if self._is_over:
             raise RuntimeError("the episode is over: call reset() before step()")
         action_tensor = torch.as_tensor(np.asarray(action, dtype=np.float32))[None]
@@ -77,7 +77,7 @@ class PlannerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return (
             result.final_observation[0].numpy(),
             float(result.reward[0]),
-            bool(result.terminated[0]),
-            bool(result.truncated[0]),
+            self._is_over,
+            False,
             info,
         )

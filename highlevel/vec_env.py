@@ -18,10 +18,9 @@ from highlevel.gym_env import spaces
 class PlannerVecEnv(VecEnv):
     """Stable-Baselines3's view of a :class:`~highlevel.environment.CommandEnvironment`.
 
-    Episodes end with the entries that Stable-Baselines3 knows (``terminal_observation``,
-    ``TimeLimit.truncated``,
-    ``episode``, ``is_success``) and ``stage`` and ``failure``. Robots whose episode goes on share empty
-    infos.
+    Episodes end with the entries that Stable-Baselines3 knows (``terminal_observation``, ``episode``,
+    ``is_success``, and ``TimeLimit.truncated``, which is never true because the time left is observed) and ``stage``
+    and ``failure``. Robots whose episode goes on share empty infos.
     """
 
     def __init__(self, environment: CommandEnvironment) -> None:
@@ -68,7 +67,7 @@ class PlannerVecEnv(VecEnv):
             for robot in over.tolist():
                 infos[robot] = {
                     "terminal_observation": final[robot],
-                    "TimeLimit.truncated": bool(result.truncated[robot]),
+                    "TimeLimit.truncated": False,
                     "is_success": bool(result.success[robot]),
                     "stage": int(result.final_stage[robot]),
                     "failure": result.failures.get(robot),

@@ -126,18 +126,18 @@ def test_rewards_add_up_over_the_option_and_stop_where_the_episode_ends(
     assert len(calls) == environment.task.action.decision_steps == 5
     assert result.reward.tolist() == [3.0, 5.0]
     assert result.success.tolist() == [True, False]
-    assert result.terminated.tolist() == [True, False] and not result.truncated.any()
+    assert result.done.tolist() == [True, False]
     assert environment.episode.tolist() == [2, 1]
     assert not torch.equal(result.observation[0], result.final_observation[0])
     torch.testing.assert_close(result.observation[1], result.final_observation[1])
 
 
-def test_an_episode_that_runs_out_of_time_is_truncated(make_environment: Make) -> None:
+def test_an_episode_that_runs_out_of_time_has_failed(make_environment: Make) -> None:
     environment = make_environment()
     environment.reset(seed=0)
     environment.decisions[:] = environment.max_decisions - 1
     result = environment.step(environment.action_map.action(environment.command))
-    assert result.truncated.all() and not result.terminated.any()
+    assert result.done.all() and not result.success.any()
     assert set(result.failures.values()) == {"approach_timeout"}
     assert (environment.decisions == 0).all()
 

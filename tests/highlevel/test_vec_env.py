@@ -67,7 +67,7 @@ def test_the_vec_env_keeps_stable_baselines_contract(make_environment: Make) -> 
     assert done.tolist() == [False, True, False]
     assert infos[0] == {} and infos[2] == {}
     info = infos[1]
-    assert info["TimeLimit.truncated"] is True and info["is_success"] is False
+    assert info["TimeLimit.truncated"] is False and info["is_success"] is False
     assert info["failure"] == "approach_timeout" and info["stage"] == 0
     assert info["episode"]["l"] == 1 and info["episode"]["r"] == pytest.approx(float(reward[1]))
     # The terminal observation belongs to the old episode, the returned one to the new.
@@ -80,7 +80,7 @@ def test_the_vec_env_keeps_stable_baselines_contract(make_environment: Make) -> 
     assert infos == [{}, {}, {}]
 
 
-def test_a_fall_is_terminated_and_not_truncated(make_environment: Make) -> None:
+def test_a_fall_ends_the_episode(make_environment: Make) -> None:
     vec_env = PlannerVecEnv(make_environment(2))
     vec_env.seed(0)
     vec_env.reset()
