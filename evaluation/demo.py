@@ -14,8 +14,8 @@ import numpy as np
 import torch
 import tyro
 
-from evaluation.highlevel import SCRIPTED, controller_for, make_policy
 from evaluation.pictures import NoOpenGLError, Painter, film_strip, following_camera, save_picture
+from evaluation.policies import SCRIPTED, controller_for, make_policy
 from evaluation.recording import EpisodeRecording, Recorder
 from evaluation.reports import (
     REPORT_FILE,

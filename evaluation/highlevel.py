@@ -13,7 +13,9 @@ from typing import Any, get_args, get_type_hints
 import torch
 import tyro
 
+from evaluation.parallel import Run, Setting, run_all
 from evaluation.plots import plot_bars
+from evaluation.policies import SCRIPTED, controller_for
 from evaluation.reports import (
     METRICS_FILE,
     REPORT_FILE,
@@ -27,16 +29,13 @@ from evaluation.reports import (
     write_results,
 )
 from evaluation.statistics import Figure, mean_figure, share_figure
-from evaluation.sweeps import SweepResult, report_lines, run_sweep, sweep_figures, write_plots
-from highlevel.environment import CommandEnvironment, PhysicsConfig
-from highlevel.episodes import EpisodeRecord, Policy, run_episodes
-from highlevel.planner import Planner, planner_hash
-from highlevel.registration import find_controller
+from evaluation.sweeps import SweepResult, cells, report_lines, sweep_figures, sweep_result, write_plots
+from highlevel.episodes import EpisodeRecord
+from highlevel.planner import planner_hash
 from highlevel.task import Task, load_task
-from lowlevel.controller import Controller, content_hash
+from lowlevel.controller import content_hash
 from lowlevel.progress import ProgressReport
 
-SCRIPTED = "scripted"
 EPISODES_FILE = "episodes.json"
 LIFT_STAGE = "lift"
 """The stage whose passing counts as the partial success ``lift_up``, if a task has it."""
@@ -73,7 +72,7 @@ class Arguments:
     robots: int = ROBOTS
     """Robots side by side; the last digits of the figures depend on it."""
     threads: int = os.cpu_count() or 1
-    """Physics threads."""
+    """Threads to keep busy: of the physics, or, with controls or sweeps, of as many simulations."""
 
 
 @dataclass(frozen=True)
@@ -114,22 +113,6 @@ def _run(arguments: Arguments) -> None:
     print(f"report: {arguments.output / REPORT_FILE}   figures: {arguments.output / METRICS_FILE}")
 
 
-def controller_for(planner: str, named: Path | None) -> Path:
-    """The ``named`` controller folder, or else the shipped one that the ``planner`` was trained on; both can be loaded.
-
-    Raises:
-        PlannerError, ControllerError, FileNotFoundError: if one of them cannot be used, or not with the other.
-    """
-    if planner == SCRIPTED:
-        folder = find_controller(named)
-    else:
-        loaded = Planner.load(planner)
-        folder = find_controller(named, loaded.config.controller)
-        loaded.require_controller(folder)
-    Controller.load(folder)
-    return folder
-
-
 def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
     """Run the episodes and, if wanted, negative controls and sweeps, each from the first episode of the seed on."""
     began = time.monotonic()
@@ -138,37 +121,29 @@ def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
         raise ValueError(f"the task {task.name!r} has no sweeps: leave out --sweeps")
     names = control_names(task) if arguments.controls else ()
     sweeps = task.sweeps if arguments.sweeps else ()
-    total = arguments.episodes + len(names) * arguments.control_episodes
-    total += sum(sweep.size for sweep in sweeps) * arguments.sweep_episodes
+    grids = [list(cells(task, sweep)) for sweep in sweeps]
+    runs = [
+        Run("episodes", task, arguments.episodes),
+        *(Run(name.replace("_", " "), with_control(task, name), arguments.control_episodes) for name in names),
+        *(
+            Run(sweep.name.replace("_", " "), variant, arguments.sweep_episodes)
+            for sweep, grid in zip(sweeps, grids, strict=True)
+            for variant in grid
+        ),
+    ]
+    setting = Setting(arguments.planner, controller, arguments.seed, arguments.robots)
     with ProgressReport() as progress:
-        bar = progress.add_task("episodes", total=total)
-        finished = 0
-
-        def run(variant: Task, count: int) -> list[EpisodeRecord]:
-            nonlocal finished
-            before = finished
-            physics = PhysicsConfig(num_threads=arguments.threads)
-            environment = CommandEnvironment(variant, controller, arguments.robots, physics=physics)
-            policy = make_policy(arguments.planner, environment, controller)
-            records = run_episodes(
-                environment,
-                policy,
-                count,
-                arguments.seed,
-                on_progress=lambda over: progress.update(bar, completed=before + over),
-            )
-            finished += count
-            return records
-
-        records = run(task, arguments.episodes)
-        controls = {}
-        for name in names:
-            progress.update(bar, description=name.replace("_", " "))
-            controls[name] = run(with_control(task, name), arguments.control_episodes)
-        swept = []
-        for sweep in sweeps:
-            progress.update(bar, description=sweep.name.replace("_", " "))
-            swept.append(run_sweep(task, sweep, lambda variant: run(variant, arguments.sweep_episodes)))
+        bar = progress.add_task("episodes", total=sum(run.count for run in runs))
+        results = run_all(
+            runs,
+            setting,
+            arguments.threads,
+            lambda name, over: progress.update(bar, completed=over, description=name),
+        )
+    remaining = iter(results)
+    records = next(remaining)
+    controls = {name: next(remaining) for name in names}
+    swept = [sweep_result(sweep, [next(remaining) for _ in grid]) for sweep, grid in zip(sweeps, grids, strict=True)]
     identity = None if arguments.planner == SCRIPTED else planner_hash(arguments.planner)
     return Evaluation(
         arguments=arguments,
@@ -180,20 +155,6 @@ def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
         sweeps=swept,
         seconds=time.monotonic() - began,
     )
-
-
-def make_policy(planner: str, environment: CommandEnvironment, controller: Path) -> Policy:
-    """The scripted expert of the environment's task, or the planner in a folder.
-
-    Raises:
-        PlannerError: if the planner does not belong to this task and controller.
-    """
-    if planner == SCRIPTED:
-        expert: Policy = environment.task.expert(environment)
-        return expert
-    loaded = Planner.load(planner, controller)
-    loaded.require_environment(environment)
-    return loaded
 
 
 def control_names(task: Task) -> tuple[str, ...]:

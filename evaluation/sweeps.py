@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,25 +34,24 @@ class SweepResult:
         return ["full success"] if columns is None else [f"{value:g}" for value in columns.values]
 
 
-def cells(task: Task, sweep: Sweep) -> Iterator[tuple[int, Task]]:
-    """Fresh copies of ``task``, one per cell, row by row, each with the number of its row."""
+def cells(task: Task, sweep: Sweep) -> Iterator[Task]:
+    """Fresh copies of ``task``, one per cell, row by row."""
     factory: Any = type(task)
     config: Any = task.config  # type: ignore[attr-defined]
-    for row, value in enumerate(sweep.rows.values):
+    for value in sweep.rows.values:
         fixed = sweep.rows.fix(config, value)
         if sweep.columns is None:
-            yield row, factory(fixed)
+            yield factory(fixed)
             continue
         for other in sweep.columns.values:
-            yield row, factory(sweep.columns.fix(fixed, other))
+            yield factory(sweep.columns.fix(fixed, other))
 
 
-def run_sweep(task: Task, sweep: Sweep, run: Callable[[Task], list[EpisodeRecord]]) -> SweepResult:
-    """Run every cell's episodes with ``run``."""
-    rows: list[list[Figure]] = [[] for _ in sweep.rows.values]
-    for row, variant in cells(task, sweep):
-        rows[row].append(share_figure([record.success for record in run(variant)]))
-    return SweepResult(sweep, tuple(tuple(row) for row in rows))
+def sweep_result(sweep: Sweep, records: Sequence[list[EpisodeRecord]]) -> SweepResult:
+    """Success in every cell, of whose episodes ``records`` has a list each, row by row."""
+    figures = [share_figure([record.success for record in cell]) for cell in records]
+    width = 1 if sweep.columns is None else len(sweep.columns.values)
+    return SweepResult(sweep, tuple(tuple(figures[i : i + width]) for i in range(0, len(figures), width)))
 
 
 def sweep_figures(results: list[SweepResult]) -> dict[str, Figure]:

@@ -91,6 +91,8 @@ def test_an_evaluation_repeats_itself_and_grows_by_new_episodes(untrained_contro
     assert [r.number for r in many.records] == [0, 1]
     assert many.records[:1] == few.records
     assert set(many.controls) == {"frictionless", "no_hands"}
+    side_by_side = evaluate(replace(many.arguments, threads=2), untrained_controller)
+    assert side_by_side.records == many.records and side_by_side.controls == many.controls
     assert all([r.number for r in records] == [0] for records in many.controls.values())
     assert few.planner is None and len(few.controller) == 16
 

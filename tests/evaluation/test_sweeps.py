@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from evaluation.sweeps import cells, report_lines, run_sweep, sweep_figures, write_plots
+from evaluation.sweeps import cells, report_lines, sweep_figures, sweep_result, write_plots
 from highlevel.episodes import EpisodeRecord
 from highlevel.task import Sweep, SweepAxis, Task, load_task
 from tasks.lift_box.config import LiftBoxConfig, SpawnConfig
@@ -17,7 +17,7 @@ from tasks.lift_box.sweeps import SWEEPS
 
 
 def _configs(sweep: Sweep) -> list[LiftBoxConfig]:
-    variants: list[Any] = [task for _, task in cells(load_task("lift_box"), sweep)]
+    variants: list[Any] = list(cells(load_task("lift_box"), sweep))
     return [variant.config for variant in variants]
 
 
@@ -50,7 +50,7 @@ def test_results_are_tabled_and_drawn(tmp_path: Path) -> None:
         light = config.spawn.mass[0] < 1.5 and config.spawn.edge[0] < 0.3
         return [EpisodeRecord(i, light and i > 0, 6, None, 10.0, 0.0) for i in range(4)]
 
-    result = run_sweep(load_task("lift_box"), sweep, run)
+    result = sweep_result(sweep, [run(variant) for variant in cells(load_task("lift_box"), sweep)])
     figures = sweep_figures([result])
     assert {name for name, figure in figures.items() if figure.value == 0.75} == {
         "full_mass_edge_0.5_0.25",
@@ -65,6 +65,6 @@ def test_results_are_tabled_and_drawn(tmp_path: Path) -> None:
 
 def test_a_sweep_of_one_quantity_has_one_column() -> None:
     sweep = Sweep("push", SweepAxis("pushes", (0.0, 1.0), lambda config, _: config))
-    result = run_sweep(load_task("lift_box"), sweep, lambda _: [EpisodeRecord(0, True, 6, None, 9.0, 0.0)])
+    result = sweep_result(sweep, [[EpisodeRecord(0, True, 6, None, 9.0, 0.0)]] * sweep.size)
     assert list(sweep_figures([result])) == ["full_push_0", "full_push_1"]
     assert result.column_labels == ["full success"]
