@@ -58,7 +58,7 @@ class PPOConfig:
     desired_kl: float = 0.015
     """KL divergence from the acting policy that steers the actor's learning rate [nat]; 0 keeps the rate."""
     actor_learning_rate: float = 3e-4
-    """First learning rate of the actor."""
+    """First learning rate of the actor; a run that continues another one keeps that one's."""
     actor_learning_rate_bounds: tuple[float, float] = (1e-5, 2e-3)
     """Range of the actor's adaptive learning rate."""
     critic_learning_rate: float = 5e-4
@@ -70,7 +70,8 @@ class PPOConfig:
     entropy_weight: float = 0.0
     """Weight of the entropy bonus [1/nat]."""
     initial_std: float = 0.25
-    """First standard deviation of the exploration noise [action units]."""
+    """First standard deviation of the exploration noise [action units]; a run that continues another one keeps that
+    one's where it is lower."""
     final_std: float = 0.05
     """Standard deviation that the noise may have at most at the end of a run [action units]; the bound falls to it from
     ``initial_std`` by the same factor in every step. The less noise, the nearer is what the policy is paid for to what
@@ -294,8 +295,17 @@ class Learner:
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a :meth:`state_dict`."""
+        """Restore a :meth:`state_dict`. The actor's rate goes on from where it was; the others are this
+        configuration's."""
         for name, module in self._modules.items():
             module.load_state_dict(state[name])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
+        low, high = self.config.actor_learning_rate_bounds
+        rates = {
+            "actor": min(max(self.learning_rate, low), high),
+            "critic": self.config.critic_learning_rate,
+            "estimator": self.config.estimator_learning_rate,
+        }
+        for name, rate in rates.items():
+            self.optimizers[name].param_groups[0]["lr"] = rate

@@ -52,6 +52,15 @@ def test_only_the_actor_rate_adapts() -> None:
     assert rates == {"actor": 1e-5, "critic": 5e-4, "estimator": 5e-4}
 
 
+def test_a_continued_run_has_the_rates_of_its_configuration() -> None:
+    first = make_ppo()
+    first.learner.optimizers["actor"].param_groups[0]["lr"] = 1e-3
+    second = make_ppo(critic_learning_rate=1e-4, estimator_learning_rate=2e-4, actor_learning_rate_bounds=(1e-5, 6e-4))
+    second.load_state_dict(first.state_dict())
+    rates = {name: o.param_groups[0]["lr"] for name, o in second.learner.optimizers.items()}
+    assert rates == {"actor": 6e-4, "critic": 1e-4, "estimator": 2e-4}
+
+
 def test_kl_is_that_of_two_gaussians() -> None:
     ppo = make_ppo(symmetry="none", epochs=1, minibatches=1, estimator_epochs=1)
     run_update(ppo, 0)
