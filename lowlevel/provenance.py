@@ -98,24 +98,31 @@ def require_unused(folder: Path) -> None:
     """Check that a new run may use ``folder``.
 
     Raises:
-        FileExistsError: if it holds the training state of another one.
+        FileExistsError: if it holds another one, saved or not.
     """
     if (folder / STATE_FILE).exists():
         raise FileExistsError(
             f"{folder} already holds a run: continue it with --resume {folder}, or give another --name"
         )
+    if (folder / RUN_FILE).exists():
+        raise FileExistsError(f"{folder} already holds a run that has saved nothing yet: give another --name")
 
 
 def make_run_folder(folder: Path) -> None:
-    """Make the folder of a new run.
+    """Make the folder of a new run, and claim it: of two runs that ask for it at the same time one gets it.
 
     Raises:
         OSError: if that is impossible.
+        FileExistsError: if another run was quicker.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OSError(f"cannot make the folder {folder} ({error.strerror}): give another --output") from error
+    try:
+        (folder / RUN_FILE).touch(exist_ok=False)
+    except FileExistsError as error:
+        raise FileExistsError(f"another run has just begun in {folder}: give another --name") from error
 
 
 def find_state(folder: Path) -> Path:
@@ -129,7 +136,7 @@ def find_state(folder: Path) -> Path:
     if not path.is_file():
         is_run = (folder / RUN_FILE).is_file()
         advice = (
-            "the run ended before its first save, so start it anew" if is_run else "give the folder of a training run"
+            "the run ended before its first save, so start a new one" if is_run else "give the folder of a training run"
         )
         raise FileNotFoundError(f"{folder} holds no {STATE_FILE}: {advice}")
     if not zipfile.is_zipfile(path):  # which is what torch.save writes

@@ -109,7 +109,8 @@ def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
     trainer = Trainer(replace(parsed.config, device=str(device)), folder)
     if parsed.warm_start:
         _load(trainer, parsed.warm_start, learning_only=True)
-    make_run_folder(folder)
+    if distributed.rank() == 0:
+        make_run_folder(folder)
     return trainer
 
 

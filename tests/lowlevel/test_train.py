@@ -17,7 +17,14 @@ from lowlevel.environment import EnvironmentConfig
 from lowlevel.network_config import NetworkConfig
 from lowlevel.plain import from_plain
 from lowlevel.presets import PRESETS
-from lowlevel.provenance import describe_run, read_run_description, read_training_config, write_run_description
+from lowlevel.provenance import (
+    describe_run,
+    make_run_folder,
+    read_run_description,
+    read_training_config,
+    require_unused,
+    write_run_description,
+)
 from lowlevel.train import main
 from lowlevel.trainer import LOG_FILE, STATE_FILE, Trainer, TrainingConfig
 
@@ -104,6 +111,18 @@ def test_command_line_trains_exports_and_resumes(tmp_path: Path) -> None:
     assert [entry["steps"] for entry in entries] == [64, 128, 192]
     description = read_run_description(folder)
     assert description["preset"] == "no-mirror" and description["config"]["ppo"]["symmetry"] == "none"
+
+
+def test_of_two_runs_with_one_name_the_second_is_refused_before_the_first_has_saved(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    require_unused(folder)
+    make_run_folder(folder)
+    with pytest.raises(FileExistsError, match="another run has just begun"):
+        make_run_folder(folder)
+    write_run_description(folder, {"preset": "simple"})
+    with pytest.raises(SystemExit, match="a run that has saved nothing yet: give another --name"):
+        main([*ARGUMENTS, "--output", str(tmp_path), "--name", "run"])
+    assert read_run_description(folder) == {"preset": "simple"}
 
 
 def test_ctrl_c_ends_a_run_that_can_be_continued(
