@@ -42,7 +42,8 @@ def add_box_scene(spec: mujoco.MjSpec) -> None:
     box = body.add_geom(name=BOX, type=mujoco.mjtGeom.mjGEOM_BOX, size=[half, half, half], mass=NOMINAL_MASS)
     box.contype, box.conaffinity = WORLD_COLLISION, WORLD_COLLISION | PALM_COLLISION
     box.condim = 4
-    box.friction = [0.6, 0.005, 0.0001]
+    # Of floor, block and box alike; hands and feet bring their own, which has priority.
+    box.friction = [1.0, 0.005, 0.0001]
     box.rgba = [0.80, 0.55, 0.25, 1.0]
 
     shell = spec.body(TORSO_BODY).add_geom(name="torso_shell", type=mujoco.mjtGeom.mjGEOM_BOX)
