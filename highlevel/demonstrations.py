@@ -181,8 +181,8 @@ def record(
                     f"the expert failed {len(ended)} times in a row: check the controller with 'evaluate-lowlevel'"
                 )
         observation = result.observation
-    kept = sorted(successes)[:count]
-    attempts = kept[-1] + 1 if len(kept) == count else len(ended)
+    kept = sorted(number for number in successes if number < leading)[:count]
+    attempts = kept[-1] + 1 if len(kept) == count else leading
     return _pack([(number, successes[number]) for number in kept], attempts, source, environment)
 
 

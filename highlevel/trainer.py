@@ -296,10 +296,12 @@ class _TrainingCallback(BaseCallback):
         self._trainer, self._update = trainer, update
         self._last_save = self._last_tick = time.monotonic()
         self._outcomes: list[bool] = []
+        self._rollout_start = 0
 
     def _on_rollout_start(self) -> None:
         # Called after an update and before the next rollout: the policy is whole.
         trainer = self._trainer
+        self._rollout_start = self.num_timesteps
         now = time.monotonic()
         trainer.trained_seconds += now - self._last_tick
         self._last_tick = now
@@ -313,7 +315,11 @@ class _TrainingCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         self._outcomes += [info["is_success"] for info in self.locals["infos"] if "is_success" in info]
-        return not self._trainer._stop_requested
+        if self._trainer._stop_requested:
+            # Nothing is learned from half a rollout, so that it does not count.
+            self.model.num_timesteps = self._rollout_start
+            return False
+        return True
 
     def _on_rollout_end(self) -> None:
         self._outcomes = self._outcomes[-200:]

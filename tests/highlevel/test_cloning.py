@@ -155,6 +155,17 @@ def test_slow_episodes_are_not_displaced_by_quick_ones(
         numbers, lengths = np.unique(recorded.episode, return_counts=True)
         assert numbers.tolist() == [0, 1, 2, 4] and lengths.tolist() == [6, 2, 2, 2]
         assert recorded.attempts == 5
+        stops = iter([False] * 4 + [True] * 100)
+        recorded = record(
+            environment,
+            _Standing(environment),
+            4,
+            seed=0,
+            noise=0.0,
+            source=source,
+            should_stop=lambda s=stops: next(s),
+        )
+        assert recorded.count == recorded.attempts == 0, "the quick ones are not kept without the slow one"
 
 
 def test_episode_records_do_not_depend_on_the_number_of_robots(
