@@ -24,7 +24,7 @@ PLATFORMS = ("egl", "osmesa")
 _PROBE_SECONDS = 60.0
 
 
-class NoOpenGLError(RuntimeError):
+class NoOpenGLError(OSError):
     """Pictures cannot be rendered on this machine; the message says what to install."""
 
 

@@ -25,7 +25,9 @@ def controller_for(planner: str, named: Path | None) -> Path:
     else:
         loaded = Planner.load(planner)
         folder = find_controller(named, loaded.config.controller)
+        Controller.load(folder)
         loaded.require_controller(folder)
+        return folder
     Controller.load(folder)
     return folder
 

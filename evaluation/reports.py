@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.statistics import Figure
+from lowlevel.checks import NonFiniteError
 from lowlevel.provenance import git_revision
 
 METRICS_FILE, REPORT_FILE = "metrics.json", "report.md"
@@ -22,7 +23,7 @@ def run_command(name: str, command: Callable[[], None]) -> None:
     """Run a command-line program: bad input and Ctrl-C end it with one line and a non-zero exit status."""
     try:
         command()
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, NonFiniteError) as error:
         sys.exit(f"{name}: {error}")
     except KeyboardInterrupt:
         print(f"{name}: interrupted, nothing was written", file=sys.stderr)

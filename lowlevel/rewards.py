@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from lowlevel.checks import NonFiniteError
 from lowlevel.commands import STANDING_SPEED, is_walking
 from lowlevel.measures import Measurement, arm_error, height_error, stumbles, torso_error, velocity_error
 from robots.g1.constants import joint_index
@@ -212,7 +213,7 @@ def compute_rewards(
     """Weighted sum (N,) and the unweighted terms, each (N,).
 
     Raises:
-        FloatingPointError: naming the term and the robot, if a term is not finite.
+        NonFiniteError: naming the term and the robot, if a term is not finite.
     """
     total = torch.zeros(len(transition.command), device=transition.command.device)
     terms = {}
@@ -227,5 +228,5 @@ def compute_rewards(
         for name, value in terms.items():
             bad = torch.nonzero(~torch.isfinite(value))[:, 0]
             if len(bad):
-                raise FloatingPointError(f"reward term {name!r} is not finite for robot {int(bad[0])}")
+                raise NonFiniteError(f"reward term {name!r} is not finite for robot {int(bad[0])}")
     return total, terms

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from lowlevel.checks import NonFiniteError
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 from lowlevel.measures import Measurement, has_fallen, measure, stumbles, torso_error
 from lowlevel.rewards import REWARD_TERMS, RewardWeights, Transition, compute_rewards
@@ -118,5 +119,5 @@ def test_total_is_the_weighted_sum_per_second(standing: Transition) -> None:
 
 def test_a_term_that_is_not_finite_is_named(standing: Transition) -> None:
     broken = moved(standing, base_height=torch.tensor([0.7, float("nan"), 0.7, 0.7]))
-    with pytest.raises(FloatingPointError, match="'base_height' is not finite for robot 1"):
+    with pytest.raises(NonFiniteError, match="'base_height' is not finite for robot 1"):
         compute_rewards(broken, RewardWeights(), 0.02)
