@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import gymnasium
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from torch import Tensor, nn
 
 CLIP = 8.0
@@ -55,10 +55,7 @@ class PlannerActor(nn.Module):
         self.scale: Tensor
         self.register_buffer("mean", torch.zeros(observation_size))
         self.register_buffer("scale", torch.ones(observation_size))
-        layers: list[nn.Module] = []
-        for width_in, width_out in zip((observation_size, *hidden[:-1]), hidden, strict=True):
-            layers += [nn.Linear(width_in, width_out), nn.ELU()]
-        self.hidden = nn.Sequential(*layers)
+        self.hidden = nn.Sequential(*create_mlp(observation_size, -1, list(hidden), nn.ELU))
         self.output = nn.Linear(hidden[-1], action_size)
 
     def forward(self, observation: Tensor) -> Tensor:

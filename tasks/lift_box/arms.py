@@ -16,6 +16,7 @@ from torch import Tensor
 from lowlevel.rotations import rotation_vector
 from robots.g1.constants import ARM_JOINTS, JOINT_NAMES, PELVIS_BODY, SIDES, WAIST_JOINTS
 from robots.g1.kinematics import PALM_FRAMES, build_model
+from robots.g1.turns import blend, turn_basis
 
 _WAIST_SIZE, _ARM_SIZE = 3, 7
 
@@ -73,11 +74,11 @@ class ArmKinematics:
             offsets.append(
                 [parent.actInv(data.oMi[joint]).homogeneous for parent, joint in zip(parents, joints, strict=True)]
             )
-            axes.append([_axis(model.joints[joint]) for joint in joints])
+            axes.append(["XYZ".index(model.joints[joint].shortname()[-1]) for joint in joints])
             palms.append(data.oMi[joints[-1]].actInv(data.oMf[model.getFrameId(palm)]).translation)
         self._offsets = torch.tensor(np.array(offsets), dtype=torch.float32)
-        self._axes = torch.tensor(np.array(axes), dtype=torch.float32)
-        self._skew = _skew(self._axes)
+        self._axes = torch.tensor(np.eye(3)[axes], dtype=torch.float32)
+        self._turns = torch.tensor(np.stack([turn_basis(row) for row in axes], axis=1), dtype=torch.float32)
         self._palms = torch.tensor(np.array(palms), dtype=torch.float32)
         limits = np.stack([model.lowerPositionLimit[7:][ARM_JOINTS], model.upperPositionLimit[7:][ARM_JOINTS]])
         margin = np.array([[self.config.limit_margin], [-self.config.limit_margin]])
@@ -87,9 +88,7 @@ class ArmKinematics:
         """Palm poses in the pelvis frame for ``waist`` (N, 3) and ``arms`` (N, 14) joints [rad]."""
         count = len(arms)
         angles = torch.cat([waist[:, None].expand(-1, 2, -1), arms.reshape(count, 2, _ARM_SIZE)], dim=-1)
-        sine, cosine = torch.sin(angles)[..., None, None], torch.cos(angles)[..., None, None]
-        # Rodrigues' formula for unit axes.
-        turns = torch.eye(3) + sine * self._skew + (1.0 - cosine) * (self._skew @ self._skew)
+        turns = blend(self._turns, angles[..., None, None])
         rotation = torch.eye(3).expand(count, 2, 3, 3)
         position = torch.zeros(count, 2, 3)
         origins, directions = [], []
@@ -193,15 +192,3 @@ def quaternion_of(rotation: Tensor) -> Tensor:
     best = diagonal.argmax(dim=-1, keepdim=True)[..., None].expand(*diagonal.shape[:-1], 1, 4)
     row = rows.gather(-2, best)[..., 0, :]
     return row / row.norm(dim=-1, keepdim=True)
-
-
-def _axis(joint: pin.JointModel) -> np.ndarray:
-    """Rotation axis (3,) of a revolute joint about one of its own axes."""
-    return np.eye(3)["XYZ".index(joint.shortname()[-1])]
-
-
-def _skew(vector: Tensor) -> Tensor:
-    """Cross-product matrices (..., 3, 3) of ``vector`` (..., 3)."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*vector.shape, 3)
