@@ -13,7 +13,7 @@ import tyro
 
 from evaluation.plots import plot_overlays
 from evaluation.reports import run_command
-from lowlevel.trainer import LOG_FILE
+from lowlevel.training_log import LOG_FILE
 
 PANELS = {
     "episode/steps_between_falls": "steps between falls",

@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -25,8 +24,9 @@ from highlevel.training_config import PlannerTrainingConfig
 from lowlevel.files import atomic_write
 from lowlevel.provenance import describe_run, find_state, make_run_folder, read_run_config, write_run_description
 from lowlevel.trainer import STATE_FILE, read_training_state
+from lowlevel.training_log import LOG_FILE, drop_entries_after, write_entry
 
-LOG_FILE, DEMONSTRATIONS_FILE = "log.jsonl", "demonstrations.npz"
+DEMONSTRATIONS_FILE = "demonstrations.npz"
 CLONED_FOLDER, BEST_FOLDER, TENSORBOARD_FOLDER = "cloned", "best", "tensorboard"
 
 
@@ -71,16 +71,12 @@ def log_figures(folder: Path, figures: dict[str, float], decisions: int, seconds
     with SummaryWriter(str(folder / TENSORBOARD_FOLDER)) as writer:
         for name, value in figures.items():
             writer.add_scalar(name, value, decisions)
-    entry = {"decisions": decisions, "seconds": round(seconds, 1), **figures}
     with (folder / LOG_FILE).open("a") as file:
-        file.write(json.dumps({name: float(f"{value:.6g}") for name, value in entry.items()}) + "\n")
+        write_entry(file, {"decisions": decisions, "seconds": seconds, **figures})
 
 
 def drop_log_after(folder: Path, decisions: int) -> None:
-    """Remove lines of ``log.jsonl`` that a killed run wrote after its last save, ``decisions`` into training."""
-    path = folder / LOG_FILE
-    if not path.exists():
-        return
-    lines = [line for line in path.read_text().splitlines() if line.endswith("}")]
-    kept = [line for line in lines if json.loads(line)["decisions"] <= decisions]
-    atomic_write(path, lambda file: file.write("".join(f"{line}\n" for line in kept).encode()))
+    """Remove from ``log.jsonl`` and TensorBoard what a killed run wrote after its last save, ``decisions`` into
+    training."""
+    drop_entries_after(folder / LOG_FILE, "decisions", decisions)
+    SummaryWriter(str(folder / TENSORBOARD_FOLDER), purge_step=decisions + 1).close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,10 +33,10 @@ from lowlevel.observation import (
 from lowlevel.ppo import PPO, PPOConfig
 from lowlevel.progress import ProgressReport
 from lowlevel.terrain import MAP_SIZE
+from lowlevel.training_log import LOG_FILE, drop_entries_after, write_entry
 from robots.g1.constants import NUM_JOINTS
 
 STATE_FILE = "training_state.pt"
-LOG_FILE = "log.jsonl"
 
 
 @dataclass(frozen=True)
@@ -257,15 +256,13 @@ class Trainer:
             return
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.steps)
         path = self.folder / LOG_FILE
-        _drop_entries_after(path, self.steps)
+        drop_entries_after(path, "steps", self.steps)
         with path.open("a") as file:
 
             def log(figures: dict[str, float]) -> None:
                 for name, value in figures.items():
                     writer.add_scalar(name, value, self.steps)
-                entry = {"steps": self.steps, "seconds": self.trained_seconds, **figures}
-                file.write(json.dumps({key: float(f"{value:.6g}") for key, value in entry.items()}) + "\n")
-                file.flush()
+                write_entry(file, {"steps": self.steps, "seconds": self.trained_seconds, **figures})
 
             try:
                 yield log
@@ -288,19 +285,3 @@ def read_training_state(path: Path) -> dict[str, Any]:
 
 def _tracking(result: StepResult) -> dict[str, Tensor]:
     return {name: function(result.measured, result.command) for name, (_, function) in TRACKING_FIGURES.items()}
-
-
-def _drop_entries_after(path: Path, steps: int) -> None:
-    """Remove log lines of iterations that a killed run made after its last save."""
-    if not path.exists():
-        return
-    kept = []
-    for line in path.read_text().splitlines():
-        try:
-            entry = json.loads(line)
-        except json.JSONDecodeError:  # the line that was being written when the run was killed
-            break
-        if entry["steps"] > steps:
-            break
-        kept.append(line)
-    atomic_write(path, lambda file: file.write("".join(f"{line}\n" for line in kept).encode()))

@@ -26,7 +26,8 @@ from lowlevel.provenance import (
     write_run_description,
 )
 from lowlevel.train import main
-from lowlevel.trainer import LOG_FILE, STATE_FILE, Trainer, TrainingConfig
+from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig
+from lowlevel.training_log import LOG_FILE
 
 TINY_NETWORK = NetworkConfig(
     history_hidden=(16,),
