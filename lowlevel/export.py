@@ -66,7 +66,7 @@ def export_controller(trainer: Trainer, folder: Path, revision: str | None = Non
 def export_run(run: Path, controller: Path) -> None:
     """Freeze the last saved state of a training ``run``, which may still be going on, into a ``controller`` folder."""
     config = read_training_config(run)
-    small = replace(config, environment=replace(config.environment, num_robots=config.ppo.minibatches))
+    small = replace(config, environment=replace(config.environment, num_robots=config.ppo.minibatches), device="cpu")
     trainer = Trainer(small, run)
     trainer.load(find_state(run), with_environment=False)
     trainer.config = config  # provenance tells of the run, not of the small environment it was rebuilt in

@@ -204,8 +204,9 @@ class TargetEncoder(nn.Module):
     """Encodes the true next state for the contrastive loss and owns its prototypes; training only.
 
     Commands are hidden from it: the history contains them too, and a latent that merely copies them would
-    already tell the samples of a batch apart. So are the other columns that are not normalised, which do not change
-    from step to step (the flag), or which the map encoder is for.
+    already tell the samples of a batch apart. So are all other columns that are not normalised: posture reference and
+    gait clock, which the history contains as well, the flag, the elevation map, which the map encoder is for, and the
+    feet's contacts, of which it still sees the forces.
     """
 
     visible: Tensor

@@ -117,6 +117,8 @@ def test_bad_input_is_one_sentence(untrained_controller: Path, tmp_path: Path) -
         (["--resume", str(tmp_path), "--seed=1"], "leave the other options out"),
         ([f"--resume={tmp_path}", "--seed=1"], "leave the other options out"),
         ([*_TINY, *where, "--selection-episodes=0"], "selection_episodes is 0"),
+        ([*_TINY, *where, "--cloning.held-out=1"], "held_out is 1.0, but it must be at least 0 and below 1"),
+        ([*_TINY, *where, "--network.hidden"], "must name widths of at least 1"),
         ([*_TINY, *where, f"--demonstration-file={__file__}"], "does not hold demonstrations"),
     ):
         with pytest.raises(SystemExit, match=message):
