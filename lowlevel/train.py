@@ -42,7 +42,8 @@ class Arguments:
     resume: Path | None = None
     """Folder of a run to continue with its own configuration; options given beside it replace parts of that."""
     warm_start: Path | None = None
-    """Folder of a run whose networks, optimisers and curriculum a new run starts from."""
+    """Folder of a run whose networks, optimisers and curriculum a new run starts from, and, unless a preset is given,
+    its configuration; options given beside it replace parts of that."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -62,7 +63,7 @@ def _run(arguments: list[str]) -> None:
         Arguments,
         args=arguments,
         default=_defaults(arguments),
-        description="Train a PILOT controller. Defaults below are those of the chosen preset or resumed run.",
+        description="Train a PILOT controller. Defaults below are those of the chosen preset or earlier run.",
     )
     device = distributed.start(parsed.config.device)
     # Physics and learning take turns on the same cores.
@@ -87,16 +88,21 @@ def _run(arguments: list[str]) -> None:
 
 
 def _defaults(arguments: list[str]) -> Arguments:
-    """Preset and resumed run decide the defaults of everything else, so they are read first."""
+    """Preset and earlier run decide the defaults of everything else, so they are read first."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset")
     parser.add_argument("--resume", type=Path)
+    parser.add_argument("--warm-start", type=Path)
     chosen = parser.parse_known_args(arguments)[0]
     if chosen.resume is not None:
         if chosen.preset is not None:
             raise ValueError("--resume takes the configuration of the run it continues: leave --preset out")
         config = read_training_config(chosen.resume)
         return Arguments(config=config, preset=read_run_description(chosen.resume).get("preset", "unknown"))
+    if chosen.warm_start is not None and chosen.preset is None:
+        find_state(chosen.warm_start)
+        config = read_training_config(chosen.warm_start)
+        return Arguments(config=config, preset=read_run_description(chosen.warm_start).get("preset", "unknown"))
     preset = chosen.preset or Arguments.preset
     if preset not in PRESETS:
         raise ValueError(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}")

@@ -25,6 +25,7 @@ from lowlevel.provenance import (
     require_unused,
     write_run_description,
 )
+from lowlevel.rewards import RewardWeights
 from lowlevel.train import main
 from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig
 from lowlevel.training_log import LOG_FILE
@@ -112,6 +113,17 @@ def test_command_line_trains_exports_and_resumes(tmp_path: Path) -> None:
     assert [entry["steps"] for entry in entries] == [64, 128, 192]
     description = read_run_description(folder)
     assert description["preset"] == "no-mirror" and description["config"]["ppo"]["symmetry"] == "none"
+
+
+def test_a_warm_start_takes_the_configuration_of_the_run_unless_a_preset_is_given(tmp_path: Path) -> None:
+    start = [*ARGUMENTS, "--output", str(tmp_path)]
+    main([*start, "--environment.rewards.linear-velocity", "2.5", "--total-steps", "64", "--name", "first"])
+    warm = [f"--output={tmp_path}", "--warm-start", str(tmp_path / "first")]
+    main([*warm, "--ppo.desired-kl", "0.01", "--name", "second"])
+    second = read_training_config(tmp_path / "second")
+    assert second.environment.rewards.linear_velocity == 2.5 and second.ppo.desired_kl == 0.01
+    main([*start, *warm[1:], "--preset", "simple", "--total-steps", "64", "--name", "third"])
+    assert read_training_config(tmp_path / "third").environment.rewards == RewardWeights()
 
 
 def test_of_two_runs_with_one_name_the_second_is_refused_before_the_first_has_saved(tmp_path: Path) -> None:
