@@ -20,15 +20,11 @@ def controller_for(planner: str, named: Path | None) -> Path:
     Raises:
         PlannerError, ControllerError, FileNotFoundError: if one of them cannot be used, or not with the other.
     """
-    if planner == SCRIPTED:
-        folder = find_controller(named)
-    else:
-        loaded = Planner.load(planner)
-        folder = find_controller(named, loaded.config.controller)
-        Controller.load(folder)
-        loaded.require_controller(folder)
-        return folder
+    loaded = None if planner == SCRIPTED else Planner.load(planner)
+    folder = find_controller(named, loaded.config.controller if loaded else None)
     Controller.load(folder)
+    if loaded:
+        loaded.require_controller(folder)
     return folder
 
 

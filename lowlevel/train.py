@@ -111,7 +111,8 @@ def _defaults(arguments: list[str]) -> Arguments:
 
 def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
     folder = parsed.output / (parsed.name or f"{parsed.preset}-{time.strftime('%Y%m%d-%H%M%S')}")
-    require_unused(folder)
+    if distributed.rank() == 0:  # other ranks may come when this one has made the folder
+        require_unused(folder)
     trainer = Trainer(replace(parsed.config, device=str(device)), folder)
     if parsed.warm_start:
         _load(trainer, parsed.warm_start, learning_only=True)

@@ -102,7 +102,7 @@ class StanceSolver:
         self.lower_limit = self.model.lowerPositionLimit[7:][LOWER_JOINTS].copy()
         self.upper_limit = self.model.upperPositionLimit[7:][LOWER_JOINTS].copy()
         self.lower_limit[[joint_index("left_knee_joint"), joint_index("right_knee_joint")]] = KNEE_MINIMUM
-        # The URDF's 35 N m for ankles and waist, where a robot has 50: what is left keeps a held posture upright.
+        # The URDF's: 35 N m at ankles and waist, where the motors give 50 (constants.Motor); a margin.
         self.effort_limit = self.model.effortLimit[6:][LOWER_JOINTS].copy()
 
     def solve(self, posture: np.ndarray, start: np.ndarray | None = None) -> Stance:
