@@ -17,6 +17,7 @@ from torch import Tensor
 
 from highlevel.demonstrations import Demonstrations
 from highlevel.policy import Normaliser
+from robots.errors import PilotError
 
 
 @dataclass(frozen=True)
@@ -66,14 +67,14 @@ def clone(
         on_progress: told epoch and training error.
 
     Raises:
-        ValueError: if there are no demonstrations or they belong to another observation.
+        PilotError: if there are no demonstrations or they belong to another observation.
     """
     if demonstrations.count == 0:
-        raise ValueError("there are no demonstrations to clone: record some first")
+        raise PilotError("there are no demonstrations to clone: record some first")
     normaliser = policy.features_extractor
     assert isinstance(normaliser, Normaliser)
     if demonstrations.observation.shape[1] != normaliser.features_dim:
-        raise ValueError(
+        raise PilotError(
             f"the demonstrations have {demonstrations.observation.shape[1]} observations, this task has "
             f"{normaliser.features_dim}: record them again"
         )

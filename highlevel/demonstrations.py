@@ -19,13 +19,14 @@ from highlevel.episodes import Policy
 from highlevel.task import ObservationBlock, rows
 from lowlevel.files import atomic_write
 from lowlevel.plain import from_plain
+from robots.errors import PilotError
 
 _NOISE_STREAM = 3
 _Step = tuple[Tensor, Tensor, float]
 """Observation, action and reward of one decision."""
 
 
-class ExpertError(RuntimeError):
+class ExpertError(PilotError):
     """The expert does not succeed; the message says what to check."""
 
 
@@ -49,7 +50,7 @@ class Source:
         """
         for field in fields(self):
             if field.name != "controller" and getattr(self, field.name) != getattr(wanted, field.name):
-                raise ValueError(f"the demonstrations were recorded with another {field.name}: record them again")
+                raise PilotError(f"the demonstrations were recorded with another {field.name}: record them again")
 
 
 @dataclass(frozen=True)
@@ -96,13 +97,13 @@ class Demonstrations:
         """Read what :meth:`save` wrote.
 
         Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if the file is damaged, of an earlier version, or holds numbers that are not finite.
+            PilotError: if there is no such file.
+            PilotError: if the file is damaged, of an earlier version, or holds numbers that are not finite.
         """
         if not path.is_file():
-            raise FileNotFoundError(f"{path} does not exist: record demonstrations first")
+            raise PilotError(f"{path} does not exist: record demonstrations first")
         if not zipfile.is_zipfile(path):
-            raise ValueError(f"{path} does not hold demonstrations: it is damaged, truncated or something else")
+            raise PilotError(f"{path} does not hold demonstrations: it is damaged, truncated or something else")
         try:
             with np.load(path, allow_pickle=False) as file:
                 source = from_plain(Source, json.loads(str(file["source"])))
@@ -110,12 +111,12 @@ class Demonstrations:
                 loaded = cls(source, file["observation"], file["action"], file["value"], file["episode"], attempts)
         except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
             reason = f"{error}, so that it is damaged or of an earlier version: record it again"
-            raise ValueError(f"{path} does not hold demonstrations: {reason}") from error
+            raise PilotError(f"{path} does not hold demonstrations: {reason}") from error
         if not len(loaded.observation) == len(loaded.action) == len(loaded.value) == len(loaded.episode):
-            raise ValueError(f"{path} does not hold demonstrations: its arrays differ in length")
+            raise PilotError(f"{path} does not hold demonstrations: its arrays differ in length")
         for name in ("observation", "action", "value"):
             if not np.isfinite(getattr(loaded, name)).all():
-                raise ValueError(f"{path} holds numbers in {name!r} that are not finite: record it again")
+                raise PilotError(f"{path} holds numbers in {name!r} that are not finite: record it again")
         return loaded
 
 

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from robots.errors import PilotError
+
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -30,10 +32,10 @@ def uniform(seed: int, episode: Tensor, stream: int, count: int) -> Tensor:
         count: numbers per episode.
 
     Raises:
-        ValueError: if the seed is negative.
+        PilotError: if the seed is negative.
     """
     if seed < 0:
-        raise ValueError(f"the seed is {seed}, but it must not be negative")
+        raise PilotError(f"the seed is {seed}, but it must not be negative")
     with np.errstate(over="ignore"):
         key = _mix(np.array([seed], dtype=np.uint64) + _GOLDEN)
         key = _mix(key + np.uint64(stream) * _GOLDEN)

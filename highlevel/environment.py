@@ -23,6 +23,7 @@ from lowlevel.measures import Measurement, has_fallen, measure
 from lowlevel.rotations import about_axis, conjugate, multiply
 from lowlevel.simulation import BatchSimulation
 from lowlevel.terrain import Terrain, TerrainConfig
+from robots.errors import PilotError
 from robots.g1.constants import (
     DEFAULT_POSITION,
     LOWER_JOINTS,
@@ -108,7 +109,7 @@ class CommandEnvironment:
         physics: PhysicsConfig | None = None,
     ) -> None:
         if num_envs < 1:
-            raise ValueError(f"the number of environments is {num_envs}, but it must be at least 1")
+            raise PilotError(f"the number of environments is {num_envs}, but it must be at least 1")
         self.task = task
         given = controller if isinstance(controller, Controller) else Controller.load(controller)
         self.controller = given.twin(num_envs)
@@ -150,7 +151,7 @@ class CommandEnvironment:
         self.task.add_to(spec)
         decimation = round(config.control_period / physics.timestep)
         if abs(decimation * physics.timestep - config.control_period) > 1e-9:
-            raise ValueError(
+            raise PilotError(
                 f"the physics step {physics.timestep} s does not divide the control period {config.control_period} s"
             )
         return BatchSimulation(spec.compile(), num_envs, decimation, physics.num_threads)
@@ -176,7 +177,7 @@ class CommandEnvironment:
         """Start the current episode number of robots ``ids`` (n,)."""
         count = len(ids)
         neutral = self.controller.config.command_space.neutral().repeat(count, 1)
-        pose = self.controller.motion.pose
+        pose = self.controller.pose
         joints = self._default.repeat(count, 1)
         joints[:, LOWER_JOINTS] = pose.lookup(neutral[:, POSTURE])[0]
         everything_zero = torch.zeros(count, 3)
@@ -203,7 +204,7 @@ class CommandEnvironment:
 
         Raises:
             RuntimeError: if :meth:`reset` was not called.
-            ValueError: if the action has another shape or is not finite.
+            PilotError: if the action has another shape or is not finite.
         """
         if self.measured is None:
             raise RuntimeError("call reset() before step()")
@@ -236,7 +237,7 @@ class CommandEnvironment:
             command = interpolate(previous, goal, number / steps)
             self.simulation.step(self.controller.act(_proprioception(self.measured), elevation, command, self._flag))
             self.measured = measure(self.simulation.read(), self.terrain)
-            falls = has_fallen(self.measured, self.controller.reference) | self.simulation.diverged()
+            falls = has_fallen(self.measured) | self.simulation.diverged()
             outcome = self.task.step(self.measured, decision)
             reward += torch.where(ended, 0.0, torch.where(falls, self.task.fall_penalty, outcome.reward))
             now = (falls | outcome.success | outcome.failure) & ~ended

@@ -14,6 +14,7 @@ from highlevel.registration import find_controller
 from highlevel.task import Task, load_task
 from lowlevel.commands import COMMAND_SIZE
 from lowlevel.controller import Controller
+from robots.errors import PilotError
 
 
 def spaces(environment: CommandEnvironment) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -41,7 +42,7 @@ class PlannerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
     ) -> None:
         if render_mode is not None:
-            raise ValueError("this environment does not render: record an episode with run-demo instead")
+            raise PilotError("this environment does not render: record an episode with run-demo instead")
         self.render_mode = None
         self.environment = CommandEnvironment(
             load_task(task) if isinstance(task, str) else task,

@@ -22,12 +22,13 @@ from highlevel.task import ObservationBlock
 from lowlevel.commands import COMMAND_SIZE
 from lowlevel.controller import content_hash
 from lowlevel.frozen_folder import FrozenFolder
+from robots.errors import PilotError
 
 FORMAT_VERSION = 1
 PLANNER_FILE, WEIGHTS_FILE = "planner.json", "weights.safetensors"
 
 
-class PlannerError(ValueError):
+class PlannerError(PilotError):
     """A planner folder cannot be used; the message says why and what to do."""
 
 
@@ -36,6 +37,7 @@ _FOLDER = FrozenFolder(
     version=FORMAT_VERSION,
     description_file=PLANNER_FILE,
     weights_file=WEIGHTS_FILE,
+    identity_file=WEIGHTS_FILE,
     example="checkpoints/highlevel",
     error=PlannerError,
 )

@@ -8,6 +8,7 @@ import gymnasium
 
 from highlevel.task import environment_id, task_names
 from lowlevel.controller import content_hash
+from robots.errors import PilotError
 
 CONTROLLERS = Path(__file__).resolve().parents[1] / "checkpoints" / "lowlevel"
 """Where shipped controllers lie."""
@@ -27,7 +28,7 @@ def find_controller(folder: Path | str | None = None, identity: str | None = Non
     """``folder`` if it is given; else the shipped controller of that ``identity``; else the default one.
 
     Raises:
-        FileNotFoundError: if no such controller is shipped.
+        PilotError: if no such controller is shipped.
     """
     if folder is not None:
         return Path(folder)
@@ -37,4 +38,4 @@ def find_controller(folder: Path | str | None = None, identity: str | None = Non
             return candidate
     found = ", ".join(path.name for path in shipped) or "none"
     wanted = DEFAULT_CONTROLLER if identity is None else identity
-    raise FileNotFoundError(f"name a controller folder: {wanted} is not among those in {CONTROLLERS}: {found}")
+    raise PilotError(f"name a controller folder: {wanted} is not among those in {CONTROLLERS}: {found}")

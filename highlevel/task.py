@@ -22,6 +22,7 @@ from torch import Tensor
 from highlevel.action import ActionConfig
 from lowlevel.measures import Measurement
 from lowlevel.simulation import BatchSimulation
+from robots.errors import PilotError
 
 
 @dataclass(frozen=True)
@@ -166,9 +167,9 @@ class Task(ABC):
         """A scripted :class:`highlevel.episodes.Policy` for a ``CommandEnvironment`` of this task.
 
         Raises:
-            ValueError: if the task has none, as by default.
+            PilotError: if the task has none, as by default.
         """
-        raise ValueError(f"task {self.name!r} has no scripted expert: train it with --demonstrations 0")
+        raise PilotError(f"task {self.name!r} has no scripted expert: train it with --demonstrations 0")
 
 
 def task_names() -> list[str]:
@@ -181,17 +182,17 @@ def load_task(name: str, **options: Any) -> Task:
     """The task in folder ``tasks/<name>``; ``options`` go to its ``TASK``.
 
     Raises:
-        ValueError: if there is no such task, or the folder does not hold one.
+        PilotError: if there is no such task, or the folder does not hold one.
     """
     if name not in task_names():
-        raise ValueError(f"there is no task {name!r}; the tasks are: {', '.join(task_names()) or 'none'}")
+        raise PilotError(f"there is no task {name!r}; the tasks are: {', '.join(task_names()) or 'none'}")
     module: ModuleType = importlib.import_module(f"tasks.{name}")
     factory = getattr(module, "TASK", None)
     if factory is None:
-        raise ValueError(f"tasks/{name}/__init__.py has no attribute TASK: it must name the task's class")
+        raise PilotError(f"tasks/{name}/__init__.py has no attribute TASK: it must name the task's class")
     task = factory(**options)
     if not isinstance(task, Task):
-        raise ValueError(f"TASK of tasks/{name} makes a {type(task).__name__}, not a highlevel.task.Task")
+        raise PilotError(f"TASK of tasks/{name} makes a {type(task).__name__}, not a highlevel.task.Task")
     return task
 
 

@@ -11,13 +11,14 @@ from typing import Annotated
 import torch
 import tyro
 
-from highlevel.demonstrations import Demonstrations, ExpertError
+from highlevel.demonstrations import Demonstrations
 from highlevel.registration import find_controller
 from highlevel.run_folder import BEST_FOLDER, create_run, read_config
 from highlevel.trainer import PlannerTrainer
 from highlevel.training_config import PlannerTrainingConfig
-from lowlevel.checks import NonFiniteError
+from lowlevel.command_line import command_line
 from lowlevel.provenance import require_unused
+from robots.errors import PilotError
 
 
 @dataclass(frozen=True)
@@ -37,16 +38,10 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``train-highlevel``."""
     given = sys.argv[1:] if arguments is None else arguments
     parsed = tyro.cli(Arguments, args=given, default=Arguments(config=PlannerTrainingConfig()))
-    try:
+    with command_line("train-highlevel", "interrupted before training began"):
         trainer = _resumed(given, parsed.resume) if parsed.resume else _fresh(parsed)
         print(f"training in {trainer.folder}", flush=True)
         trainer.run()
-    except (ValueError, OSError, ExpertError, NonFiniteError) as error:
-        first_line, _, _ = str(error).partition("\n")
-        sys.exit(f"train-highlevel: {first_line}")
-    except KeyboardInterrupt:
-        print("train-highlevel: interrupted before training began", file=sys.stderr)
-        sys.exit(130)
     if trainer.best_rate >= 0:
         best = trainer.folder / BEST_FOLDER
         print(f"best planner {best} with {trainer.best_rate:.1%} success on the selection episodes")
@@ -73,7 +68,7 @@ def _fresh(arguments: Arguments) -> PlannerTrainer:
 def _resumed(given: list[str], folder: Path) -> PlannerTrainer:
     others = [word for word in given if word.startswith("--") and word.partition("=")[0] != "--resume"]
     if others:
-        raise ValueError("--resume takes the configuration of the run it continues: leave the other options out")
+        raise PilotError("--resume takes the configuration of the run it continues: leave the other options out")
     trainer = _trainer(read_config(folder), folder)
     trainer.load()
     return trainer

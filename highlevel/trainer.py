@@ -38,6 +38,7 @@ from lowlevel.controller import Controller, content_hash
 from lowlevel.interrupts import stop_on_signals
 from lowlevel.progress import ProgressReport
 from lowlevel.provenance import describe_run
+from robots.errors import PilotError
 
 SELECTION_SEED, DEMONSTRATION_SEED, TRAINING_SEED = 1_000_000, 2_000_000, 3_000_000
 """Seeds of the episodes for each purpose, far from each other and from those of evaluations, so none is met twice."""
@@ -51,12 +52,12 @@ class PlannerTrainer:
         folder: where everything goes.
 
     Raises:
-        ValueError: if the task is unknown, the controller cannot be used, or a number does not fit.
+        PilotError: if the task is unknown, the controller cannot be used, or a number does not fit.
     """
 
     def __init__(self, config: PlannerTrainingConfig, folder: Path) -> None:
         if config.controller is None:
-            raise ValueError("the run needs the folder of a controller")
+            raise PilotError("the run needs the folder of a controller")
         config.require_valid()
         self.config = config
         self.folder = folder
@@ -263,8 +264,8 @@ class PlannerTrainer:
         """Continue from the training state in the folder; running episodes begin anew.
 
         Raises:
-            FileNotFoundError: if there is none.
-            ValueError: if it is damaged, belongs to another configuration, or the controller has changed since.
+            PilotError: if there is none.
+            PilotError: if it is damaged, belongs to another configuration, or the controller has changed since.
         """
         state = read_state(self.folder)
         try:
@@ -275,9 +276,9 @@ class PlannerTrainer:
             episode, controller = state["episode"], state["controller"]
         except (KeyError, RuntimeError, ValueError) as error:
             reason = str(error).splitlines()[-1].strip()
-            raise ValueError(f"the training state in {self.folder} does not fit this run: {reason}") from error
+            raise PilotError(f"the training state in {self.folder} does not fit this run: {reason}") from error
         if controller != self.controller_hash:
-            raise ValueError(
+            raise PilotError(
                 f"this run is for controller {controller}, but {self.controller} is {self.controller_hash} now: "
                 "start a new run"
             )

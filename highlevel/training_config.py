@@ -7,6 +7,7 @@ from pathlib import Path
 
 from highlevel.cloning import CloningConfig
 from highlevel.policy import PlannerNetwork
+from robots.errors import PilotError
 
 
 @dataclass(frozen=True)
@@ -100,13 +101,13 @@ class PlannerTrainingConfig:
         }
         for name, count in counts.items():
             if count < 1:
-                raise ValueError(f"{name} is {count}, but it must be at least 1")
+                raise PilotError(f"{name} is {count}, but it must be at least 1")
         if not 0.0 <= self.cloning.held_out < 1.0:
-            raise ValueError(f"cloning.held_out is {self.cloning.held_out}, but it must be at least 0 and below 1")
+            raise PilotError(f"cloning.held_out is {self.cloning.held_out}, but it must be at least 0 and below 1")
         if not self.network.hidden or min(self.network.hidden) < 1:
-            raise ValueError(f"network.hidden is {self.network.hidden}, but it must name widths of at least 1")
+            raise PilotError(f"network.hidden is {self.network.hidden}, but it must name widths of at least 1")
         if self.decisions_per_update % self.ppo.batch_size != 0:
-            raise ValueError(
+            raise PilotError(
                 f"the batch size {self.ppo.batch_size} must divide a rollout of {self.decisions_per_update} decisions "
                 f"({self.num_envs} robots times {self.ppo.decisions_per_update})"
             )

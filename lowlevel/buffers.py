@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lowlevel.nominal_state import NominalState
 from lowlevel.observation import FRAME_SIZE, HISTORY_LENGTH
+from lowlevel.reference import ReferenceState
 from lowlevel.terrain import MAP_SIZE
 from robots.g1.constants import NUM_JOINTS
 
@@ -18,20 +18,18 @@ class Buffers:
     """Per-robot tensors that live across steps; with the simulation's state they are the whole environment."""
 
     command: Tensor
-    tracked_command: Tensor
+    kind: Tensor
     flag: Tensor
     command_countdown: Tensor
     episode_step: Tensor
     action: Tensor
     previous_action: Tensor
-    previous_target: Tensor
-    nominal: NominalState
+    reference: ReferenceState
     history: Tensor
     elevation: Tensor
     foot_air_time: Tensor
     foot_contact_time: Tensor
     hand_force: Tensor
-    velocity: Tensor
 
     @classmethod
     def empty(cls, neutral: Tensor) -> Buffers:
@@ -43,18 +41,16 @@ class Buffers:
 
         return cls(
             command=neutral,
-            tracked_command=neutral.clone(),
+            kind=torch.zeros(n, dtype=torch.long, device=neutral.device),
             flag=zeros(1),
             command_countdown=zeros(),
             episode_step=torch.zeros(n, dtype=torch.long, device=neutral.device),
             action=zeros(NUM_JOINTS),
             previous_action=zeros(NUM_JOINTS),
-            previous_target=zeros(NUM_JOINTS),
-            nominal=NominalState.standing(neutral.clone()),
+            reference=ReferenceState.standing(neutral.clone()),
             history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
             elevation=zeros(MAP_SIZE),
             foot_air_time=zeros(2),
             foot_contact_time=zeros(2),
             hand_force=zeros(2, 3),
-            velocity=zeros(3),
         )

@@ -5,8 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from robots.errors import PilotError
 
-class NonFiniteError(RuntimeError):
+
+class NonFiniteError(PilotError):
     """A tensor holds NaN or Inf; the message names the tensor and the rows it was found in."""
 
 

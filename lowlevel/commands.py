@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from robots.errors import PilotError
 from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, JOINT_NAMES
 from robots.g1.mirror import ARMS_MIRROR, Mirror, concatenate, signs
+from robots.g1.nominal_pose import NominalPose
 
 VELOCITY = slice(0, 3)
 """vx, vy [m/s] and yaw rate [rad/s] in the heading frame (the yaw-only frame of the pelvis)."""
@@ -64,104 +67,128 @@ def command_space(joint_lower: list[float], joint_upper: list[float]) -> Command
 
 
 @dataclass(frozen=True)
-class CommandMixture:
-    """Shares of the command groups and their ranges; the defaults are those of the evaluation protocol."""
+class CommandKind:
+    """A box of commands that contains the neutral one, or lies ahead of it."""
 
-    walk_and_work: float = 0.4
-    """Share of commands that walk with a posture and moving arms (I = 1)."""
-    stand_and_work: float = 0.4
-    """Share of commands that stand still with the full posture range and moving arms (I = 1)."""
-    stand: float = 0.0
-    """Share of commands that stand still in the neutral posture (I = 0); what is left walks in it (I = 0)."""
-    slow: float = 0.0
-    """Share of the walking commands whose velocity is scaled down by ``slow_scale``: a planner walks slowly."""
-    slow_scale: float = 0.35
-    """Factor on the velocity of slow commands."""
-    walking_min_height: float = 0.55
-    """Lowest base height while walking [m]."""
-    walking_max_roll: float = 0.2
-    """Largest torso roll while walking [rad]."""
-    walking_pitch: tuple[float, float] = (-0.2, 0.5)
-    """Torso pitch range while walking [rad]."""
-    walking_max_yaw: float = 0.5
-    """Largest torso yaw while walking [rad]."""
+    velocity: tuple[tuple[float, float], tuple[float, float], tuple[float, float]] = ((0.0, 0.0),) * 3
+    """Ranges of vx, vy [m/s] and yaw rate [rad/s]."""
+    height: tuple[float, float] = (0.76, 0.76)
+    """[m]"""
+    torso: tuple[tuple[float, float], tuple[float, float], tuple[float, float]] = ((0.0, 0.0),) * 3
+    """Ranges of roll, pitch and yaw [rad]."""
+    arms: bool = False
+    """Whether the arms move; they hang at their default otherwise."""
+    tracks: bool = False
+    """The tracking flag I."""
+    steering: float = 1.0
+    """Chance that vy, and independently the yaw rate, is other than zero."""
 
 
-@dataclass(frozen=True)
-class CommandRange:
-    """How much of the command space is open, each factor in [0, 1] (set by the curriculum)."""
+_VELOCITY = ((-0.8, 1.2), (-0.5, 0.5), (-0.8, 0.8))
+_WALKING_TORSO = ((-0.2, 0.2), (-0.2, 0.5), (-0.5, 0.5))
+_TORSO = ((-0.4, 0.4), (-0.3, 1.5), (-1.5, 1.5))
 
-    velocity: float = 1.0
-    height: float = 1.0
-    torso: float = 1.0
-    arms: float = 1.0
+KINDS: dict[str, CommandKind] = {
+    "stand": CommandKind(),
+    "forward": CommandKind(velocity=((0.4, 1.2), (0.0, 0.0), (0.0, 0.0))),
+    "steer": CommandKind(velocity=_VELOCITY, steering=0.5),
+    "slow": CommandKind(velocity=((-0.3, 0.4), (-0.2, 0.2), (-0.3, 0.3)), steering=0.5),
+    "walk": CommandKind(velocity=_VELOCITY),
+    "squat": CommandKind(height=(0.30, 0.76), torso=((0.0, 0.0), (-0.1, 0.9), (0.0, 0.0)), tracks=True),
+    "walk_and_work": CommandKind(_VELOCITY, height=(0.55, 0.76), torso=_WALKING_TORSO, arms=True, tracks=True),
+    "stand_and_work": CommandKind(height=(0.30, 0.76), torso=_TORSO, arms=True, tracks=True),
+}
+"""Kinds of command by name. Training draws few at a time: over the whole command space the policy gradient is nearly
+all noise."""
+
+Mixture = tuple[tuple[str, float], ...]
+"""Kinds with their shares, which add up to 1."""
+
+PROTOCOL: Mixture = (("walk_and_work", 0.4), ("stand_and_work", 0.4), ("walk", 0.2))
+"""The evaluation's mixture."""
 
 
 class CommandSampler:
-    """Draws commands of the mixture, restricted to the open part of the ranges."""
+    """Draws commands by kind."""
 
-    def __init__(self, space: CommandSpace, mixture: CommandMixture, device: torch.device | str = "cpu") -> None:
+    def __init__(self, space: CommandSpace, device: torch.device | str = "cpu") -> None:
         self.space = space
-        self.mixture = mixture
         self.lower, self.upper = space.bounds(device)
         self.neutral = space.neutral(device)
 
-    def sample(self, count: int, open_range: CommandRange, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw ``count`` commands.
+        def column(read: Callable[[CommandKind], object]) -> Tensor:
+            return torch.tensor([read(kind) for kind in KINDS.values()], dtype=torch.float32, device=device)
+
+        boxes = column(lambda kind: (*kind.velocity, kind.height, *kind.torso))
+        self._low, self._high = boxes.unbind(-1)
+        self._arms, self._tracks = column(lambda kind: kind.arms), column(lambda kind: kind.tracks)
+        self._steering = column(lambda kind: kind.steering)
+
+    def draw_kinds(self, count: int, probabilities: Tensor, generator: torch.Generator) -> Tensor:
+        """Numbers of ``count`` kinds (count,), drawn with ``probabilities`` (kinds,)."""
+        return torch.multinomial(probabilities, count, replacement=True, generator=generator)
+
+    def sample(self, kinds: Tensor, opening: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw one command of each of ``kinds`` (n,).
+
+        ``opening`` (kinds,) in [0, 1]: the share of the way from the neutral command that each kind may go.
 
         Returns:
-            command (count, 21) and tracking flag I (count, 1); not yet clamped to the feasible region.
+            command (n, 21) and tracking flag I (n, 1); not yet clamped to the feasible region.
         """
-        mixture = self.mixture
+        count, open_to = len(kinds), opening[kinds, None]
 
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, device=self.lower.device)
 
-        group = uniform(count)
-        working = mixture.walk_and_work + mixture.stand_and_work
-        walks = (group < mixture.walk_and_work) | (group >= working + mixture.stand)
-        works = group < working
-        command = self.neutral.repeat(count, 1)
-
-        velocity = self.lower[VELOCITY] + uniform(count, 3) * (self.upper[VELOCITY] - self.lower[VELOCITY])
-        if mixture.slow > 0.0:
-            velocity = torch.where(uniform(count, 1) < mixture.slow, mixture.slow_scale * velocity, velocity)
-        command[:, VELOCITY] = open_range.velocity * velocity * walks[:, None]
-
-        lowest = torch.where(walks, mixture.walking_min_height, self.lower[HEIGHT].item())
-        highest = self.upper[HEIGHT]
-        command[:, HEIGHT] = highest - open_range.height * (highest - lowest) * uniform(count)
-
-        walking = torch.tensor(
-            [
-                [-mixture.walking_max_roll, mixture.walking_pitch[0], -mixture.walking_max_yaw],
-                [mixture.walking_max_roll, mixture.walking_pitch[1], mixture.walking_max_yaw],
-            ],
-            device=self.lower.device,
-        )
-        low = torch.where(walks[:, None], walking[0], self.lower[TORSO])
-        high = torch.where(walks[:, None], walking[1], self.upper[TORSO])
-        command[:, TORSO] = open_range.torso * (low + uniform(count, 3) * (high - low))
-
-        command[:, ARMS] = self._sample_arms(count, open_range.arms, generator)
-        command[:, HEIGHT : ARMS.stop] = torch.where(
-            works[:, None], command[:, HEIGHT : ARMS.stop], self.neutral[HEIGHT : ARMS.stop]
-        )
+        low, high = self._low[kinds], self._high[kinds]
+        wanted = low + uniform(count, ARMS.start) * (high - low)
+        wanted[:, 1:3] *= uniform(count, 2) < self._steering[kinds, None]
+        neutral = self.neutral[: ARMS.start]
+        arms = self._sample_arms(count, (open_to * self._arms[kinds, None]), generator)
+        command = torch.cat([neutral + open_to * (wanted - neutral), arms], dim=1)
         stands = command[:, VELOCITY].norm(dim=-1) < STANDING_SPEED
         command[stands, VELOCITY] = 0.0
-        return command, works[:, None].float()
+        return command, self._tracks[kinds, None]
 
-    def _sample_arms(self, count: int, openness: float, generator: torch.Generator) -> Tensor:
-        """Equations 2 and 3: exponentially distributed radius, random direction, per joint (count, 14)."""
+    def _sample_arms(self, count: int, openness: Tensor, generator: torch.Generator) -> Tensor:
+        """Equations 2 and 3: exponentially distributed radius, random direction, per joint (count, 14).
+
+        ``openness`` (count, 1) is the paper's alpha; 0 leaves the arms at their default.
+        """
         shape = (count, ARMS.stop - ARMS.start)
         device = self.lower.device
         rate = 20.0 * (1.0 - 0.99 * openness)
         uniform = torch.rand(shape, generator=generator, device=device)
-        radius = -torch.log1p(-uniform * (1.0 - torch.exp(torch.tensor(-rate)))) / rate
-        distance = torch.rand(shape, generator=generator, device=device) * radius
+        radius = -torch.log1p(-uniform * (1.0 - torch.exp(-rate))) / rate
+        distance = torch.rand(shape, generator=generator, device=device) * radius * (openness > 0.0)
         towards_upper = torch.randn(shape, generator=generator, device=device) > 0
         bound = torch.where(towards_upper, self.upper[ARMS], self.lower[ARMS])
         return self.neutral[ARMS] + (bound - self.neutral[ARMS]) * distance
+
+
+def shares(mixture: Mixture, device: torch.device | str = "cpu") -> Tensor:
+    """Share of every kind (kinds,) in ``mixture``.
+
+    Raises:
+        ValueError: naming a kind that is unknown, or if the shares do not add up to 1.
+    """
+    total = torch.zeros(len(KINDS), device=device)
+    for name, share in mixture:
+        if name not in KINDS:
+            raise PilotError(f"unknown kind of command {name!r}; choose from {', '.join(KINDS)}")
+        total[list(KINDS).index(name)] += share
+    if abs(float(total.sum()) - 1.0) > 1e-6:
+        raise PilotError(f"the shares of the kinds of command add up to {float(total.sum()):.3f}, not to 1")
+    return total
+
+
+def clamp_posture(command: Tensor, pose: NominalPose) -> Tensor:
+    """Move the posture of ``command`` (N, 21) into the region that the robot can hold; the rest is unchanged.
+
+    The region is the robot's and the same for every controller: ``pose`` is its nominal-pose table.
+    """
+    return torch.cat([command[:, VELOCITY], pose.clamp(command[:, POSTURE]), command[:, ARMS]], dim=1)
 
 
 def is_walking(command: Tensor) -> Tensor:

@@ -5,7 +5,6 @@ Whatever a controller remembers between steps goes in and comes out; nothing els
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,8 +12,6 @@ from torch import Tensor, nn
 
 from lowlevel.commands import CommandSpace
 from lowlevel.networks import PilotActor
-from lowlevel.nominal import NominalMotion
-from lowlevel.nominal_state import NominalState
 from lowlevel.observation import (
     FRAME_SIZE,
     HISTORY_LENGTH,
@@ -22,49 +19,14 @@ from lowlevel.observation import (
     Proprioception,
     map_observation,
     push_history,
+    split_frame,
     start_history,
 )
+from lowlevel.reference import Reference, ReferenceState
 from robots.g1.constants import NUM_JOINTS
 
-
-class Memory(NamedTuple):
-    """What a controller carries from one control step to the next, one row per robot."""
-
-    nominal: NominalState
-    """References, gait clock and feedback."""
-    action: Tensor
-    """Last action (N, 29), in action scales."""
-    history: Tensor
-    """Stacked frames (N, 6, FRAME_SIZE), oldest first."""
-    is_fresh: Tensor
-    """Robots that have not acted since their reset (N,) bool: their history starts with the next frame."""
-
-    @classmethod
-    def fresh(
-        cls, num_robots: int, space: CommandSpace, settling_time: float, device: torch.device | str = "cpu"
-    ) -> Memory:
-        """The memory of robots that have not acted yet and first stand still for ``settling_time`` [s]."""
-        return cls(
-            nominal=NominalState.standing(space.neutral(device).repeat(num_robots, 1), settling_time),
-            action=torch.zeros(num_robots, NUM_JOINTS, device=device),
-            history=torch.zeros(num_robots, HISTORY_LENGTH + 1, FRAME_SIZE, device=device),
-            is_fresh=torch.ones(num_robots, dtype=torch.bool, device=device),
-        )
-
-    @classmethod
-    def from_tensors(cls, tensors: Sequence[Tensor]) -> Memory:
-        """The memory whose :attr:`tensors` these are."""
-        count = len(NominalState._fields)
-        return cls(NominalState(*tensors[:count]), *tensors[count:])
-
-    @property
-    def tensors(self) -> tuple[Tensor, ...]:
-        """One after the other, as :data:`MEMORY_NAMES` names them."""
-        return *self.nominal, *self[1:]
-
-
-MEMORY_NAMES = (*NominalState._fields, *Memory._fields[1:])
-"""Names of :attr:`Memory.tensors`."""
+Memory = dict[str, Tensor]
+"""What a controller carries from one control step to the next: name to tensor, one row per robot."""
 
 
 class StepResult(NamedTuple):
@@ -79,44 +41,62 @@ class StepResult(NamedTuple):
 
 
 class ControlStep(nn.Module):
-    """Measurements, command and memory in; joint targets and memory out."""
+    """Measurements, command and memory in; joint targets and memory out.
+
+    It remembers the slewed command "reference" (N, 21), the gait "phase" (N,) [rad], the last "action" (N, 29) in
+    action scales, and the "history" (N, 6, FRAME_SIZE) of frames, oldest first. A history of zeros means that the
+    robot has not acted yet: it starts with the next frame.
+    """
 
     def __init__(
-        self, actor: PilotActor, motion: NominalMotion, space: CommandSpace, action_scale: Tensor, action_limit: float
+        self, actor: PilotActor, reference: Reference, space: CommandSpace, action_scale: Tensor, action_limit: float
     ) -> None:
         """``action_scale`` (29,) [rad]; actions are clipped to +- ``action_limit`` of it."""
         super().__init__()
         self.actor = actor
-        self.motion = motion
+        self.reference = reference
         self.action_limit = action_limit
+        self._space = space
         self._action_scale = action_scale
-        self._build_frame = FrameBuilder(space, motion, action_scale.device)
+        self._build_frame = FrameBuilder(space, reference, action_scale.device)
+
+    @property
+    def experts(self) -> int:
+        """Entries of the gate."""
+        network = self.actor.config
+        return network.experts if network.mixture else 1
+
+    def first_memory(self, num_robots: int) -> Memory:
+        """The memory of robots that have not acted yet and stand."""
+        device = self._action_scale.device
+        return {
+            "reference": self._space.neutral(device).repeat(num_robots, 1),
+            "phase": torch.zeros(num_robots, device=device),
+            "action": torch.zeros(num_robots, NUM_JOINTS, device=device),
+            "history": torch.zeros(num_robots, HISTORY_LENGTH + 1, FRAME_SIZE, device=device),
+        }
 
     def forward(
         self, measured: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor, memory: Memory
     ) -> StepResult:
         """One control period, with ``elevation_map`` (N, 121) [m], ``command`` (N, 21) and ``flag`` (N, 1)."""
-        command = self.motion.clamp(command)
-        state = self.motion.advance(memory.nominal, command)
+        command = self.reference.clamp(command)
+        state = self.reference.advance(ReferenceState(memory["reference"], memory["phase"]), command)
         frame = self._build_frame(
             measured.joint_position,
             measured.joint_velocity,
             measured.base_angular_velocity,
             measured.projected_gravity,
-            self.motion.tracked_command(state, command),
-            memory.action,
+            command,
+            memory["action"],
             state,
         )
-        started = memory.is_fresh[:, None, None]
-        history = torch.where(started, start_history(frame), push_history(memory.history, frame))
+        # Gravity is a unit vector in every frame that was ever measured.
+        last_gravity = split_frame(memory["history"][:, -1])["projected_gravity"]
+        is_first = (last_gravity == 0.0).all(dim=1)[:, None, None]
+        history = torch.where(is_first, start_history(frame), push_history(memory["history"], frame))
         output = self.actor(history.flatten(1), map_observation(elevation_map), flag)
         action = output.mean.clamp(-self.action_limit, self.action_limit)
-        nominal_target, state = self.motion.joint_targets(
-            state,
-            measured.joint_position,
-            measured.projected_gravity,
-            measured.base_angular_velocity,
-            output.velocity,
-        )
-        remembered = Memory(state, action, history, torch.zeros_like(memory.is_fresh))
-        return StepResult(nominal_target + action * self._action_scale, output.gate, remembered)
+        targets = self.reference.joint_targets(state) + action * self._action_scale
+        remembered = {"reference": state.command, "phase": state.phase, "action": action, "history": history}
+        return StepResult(targets, output.gate, remembered)

@@ -1,18 +1,17 @@
 """The frozen controller: whole-body commands in, PD joint targets out, at 50 Hz, for any number of robots.
 
-A controller is a folder. Beside this package nothing else is needed to run it, and nothing in it is pickled; its ONNX
-file needs nothing but ONNX Runtime:
+A controller is a folder. Nothing in it is pickled:
 
 ``controller.json``      every convention at full precision, and where the controller comes from
-``weights.safetensors``  policy weights, normaliser and nominal-pose table
-``controller.onnx``      the whole control step as :mod:`lowlevel.onnx_step` describes it, for other runtimes
+``controller.onnx``      the whole control step as :mod:`lowlevel.onnx_step` describes it; needs ONNX Runtime alone
+``weights.safetensors``  policy weights, normaliser and nominal-pose table, for torch
 ``golden.json``          reference inputs and outputs that any port can be checked against
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,27 +20,22 @@ import torch
 from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidArgument, InvalidGraph, InvalidProtobuf
 from torch import Tensor
 
-from lowlevel.commands import CommandSpace
+from lowlevel.commands import CommandSpace, clamp_posture
 from lowlevel.control_step import ControlStep, Memory
 from lowlevel.files import atomic_write
 from lowlevel.frozen_folder import FrozenFolder
 from lowlevel.golden import GOLDEN_ROBOTS, golden_vectors
 from lowlevel.networks import NetworkConfig, ObservationSizes, PilotActor
-from lowlevel.nominal import NominalMotion
-from lowlevel.nominal_config import NominalConfig
-from lowlevel.observation import (
-    FRAME,
-    FRAME_SIZE,
-    HISTORY_LENGTH,
-    Proprioception,
-    normalised_columns,
-)
+from lowlevel.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, Proprioception, columns, normalised_columns
 from lowlevel.onnx_step import OnnxStep, export_step
+from lowlevel.plain import from_plain
+from lowlevel.reference import Reference, ReferenceConfig
 from lowlevel.terrain import MAP_SIZE
+from robots.errors import PilotError
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
 
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
     "controller.json",
     "weights.safetensors",
@@ -50,7 +44,7 @@ CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
 )
 
 
-class ControllerError(ValueError):
+class ControllerError(PilotError):
     """A controller folder cannot be used; the message says which file is at fault and why."""
 
 
@@ -59,6 +53,7 @@ _FOLDER = FrozenFolder(
     version=FORMAT_VERSION,
     description_file=CONFIG_FILE,
     weights_file=WEIGHTS_FILE,
+    identity_file=ONNX_FILE,
     example="checkpoints/lowlevel",
     error=ControllerError,
 )
@@ -66,7 +61,7 @@ _FOLDER = FrozenFolder(
 
 @dataclass(frozen=True)
 class ControllerConfig:
-    """Contents of ``controller.json`` that define behaviour."""
+    """What whoever runs the controller must know."""
 
     joint_names: tuple[str, ...]
     default_position: tuple[float, ...]
@@ -86,14 +81,20 @@ class ControllerConfig:
     control_period: float
     """[s]"""
     command_space: CommandSpace
-    nominal: NominalConfig
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """What it takes to compute the control step in torch."""
+
+    reference: ReferenceConfig
     network: NetworkConfig
     pose_axes: tuple[Axis, Axis, Axis, Axis]
     """Grid of the nominal-pose table: height, roll, pitch, yaw."""
 
 
 class Controller:
-    """A frozen PILOT policy with its history, reference filter and gait clock.
+    """A frozen policy with its memory.
 
     Call :meth:`reset` once for a number of robots, then :meth:`act` every control period.
     """
@@ -101,37 +102,35 @@ class Controller:
     def __init__(
         self,
         config: ControllerConfig,
-        actor: PilotActor,
-        pose: NominalPose,
+        step: ControlStep | OnnxStep,
         provenance: dict[str, Any],
         device: torch.device | str = "cpu",
-        runtime: OnnxStep | None = None,
     ) -> None:
-        """``runtime`` computes the control steps in place of torch, with the same weights."""
         self.config = config
         self.provenance = provenance
         self.device = torch.device(device)
-        self.actor = actor.to(device).eval().requires_grad_(False)
         self.gains = Gains(np.array(config.stiffness), np.array(config.damping), np.array(config.action_scale))
-        self.motion = NominalMotion(config.nominal, self.gains, config.control_period, device, pose)
-        self.action_scale = torch.tensor(config.action_scale, device=device)
-        self.step = ControlStep(self.actor, self.motion, config.command_space, self.action_scale, config.action_limit)
-        self._compute = self.step if runtime is None else runtime
-        self._memory: Memory | None = None
+        self.pose = NominalPose.load(device)
+        self.step = step
+        self._memory: Memory = {}
         self.gate = torch.zeros(0)
         """Expert activations of the last :meth:`act` (N, experts)."""
+
+    @property
+    def experts(self) -> int:
+        """Experts whose activations :attr:`gate` holds."""
+        return self.step.experts
 
     # -- control ----------------------------------------------------------------------------------------------
 
     def reset(self, num_robots: int, ids: Tensor | None = None) -> None:
-        """Forget everything about robots ``ids`` (all ``num_robots`` by default): history, last action, clock."""
-        space, settling_time = self.config.command_space, self.config.nominal.settling_time
-        fresh = Memory.fresh(num_robots, space, settling_time, self.device)
-        if self._memory is None or ids is None or len(self._memory.action) != num_robots:
+        """Forget everything about robots ``ids`` (all ``num_robots`` by default)."""
+        fresh = self.step.first_memory(num_robots)
+        if not self._memory or ids is None or len(self._memory["action"]) != num_robots:
             self._memory = fresh
             return
-        for remembered, cleared in zip(self._memory.tensors, fresh.tensors, strict=True):
-            remembered[ids] = cleared[ids]
+        for name, cleared in fresh.items():
+            self._memory[name][ids] = cleared[ids]
 
     @torch.no_grad()
     def act(self, proprioception: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor) -> Tensor:
@@ -146,51 +145,41 @@ class Controller:
         Raises:
             RuntimeError: if :meth:`reset` was not called for this number of robots.
         """
-        memory = self._memory
-        if memory is None or len(memory.action) != len(command):
+        if not self._memory or len(self._memory["action"]) != len(command):
             raise RuntimeError(f"call reset({len(command)}) before act() with {len(command)} robots")
-        result = self._compute(proprioception, elevation_map, command, flag, memory)
+        result = self.step(proprioception, elevation_map, command, flag, self._memory)
         self.gate, self._memory = result.gate, result.memory
         return result.targets
 
     def clamp_command(self, command: Tensor) -> Tensor:
         """The command (N, 21) that is observed and scored in place of ``command``."""
-        return self.motion.clamp(command)
+        return clamp_posture(command, self.pose)
 
     @property
     def reference(self) -> Tensor:
-        """Slewed command (N, 21) that the nominal motion follows."""
-        if self._memory is None:
-            raise RuntimeError("call reset() first")
-        return self._memory.nominal.reference
-
-    def twin(self, num_robots: int) -> Controller:
-        """A controller on the CPU with copies of the weights and a fresh memory for ``num_robots`` robots.
-
-        One that runs in ONNX Runtime stays there.
-        """
-        pose = self.motion.pose
-        tensors = [getattr(pose, name).cpu() for name in _POSE_TENSORS]
-        actor = PilotActor(self.actor.sizes, self.config.network, ~normalised_columns(FRAME))
-        actor.load_state_dict({name: tensor.cpu() for name, tensor in self.actor.state_dict().items()})
-        runtime = self._compute if isinstance(self._compute, OnnxStep) else None
-        twin = Controller(self.config, actor, NominalPose(pose.axes, *tensors), self.provenance, runtime=runtime)
-        twin.reset(num_robots)
-        return twin
+        """Slewed command (N, 21)."""
+        return self._remembered("reference")
 
     @property
     def last_history(self) -> Tensor:
         """Stacked frames (N, 6 * FRAME_SIZE) that the network saw last."""
-        if self._memory is None:
-            raise RuntimeError("call reset() first")
-        return self._memory.history.flatten(1)
+        return self._remembered("history").flatten(1)
 
     @property
     def last_action(self) -> Tensor:
         """Residual action (N, 29) of the last step, in action scales."""
-        if self._memory is None:
+        return self._remembered("action")
+
+    def _remembered(self, name: str) -> Tensor:
+        if not self._memory:
             raise RuntimeError("call reset() first")
-        return self._memory.action
+        return self._memory[name]
+
+    def twin(self, num_robots: int) -> Controller:
+        """A controller that shares the step and has a memory of its own for ``num_robots`` robots."""
+        twin = Controller(self.config, self.step, self.provenance, self.device)
+        twin.reset(num_robots)
+        return twin
 
     # -- folders ----------------------------------------------------------------------------------------------
 
@@ -199,56 +188,96 @@ class Controller:
         cls,
         folder: Path | str,
         device: torch.device | str = "cpu",
-        runtime: Literal["torch", "onnx"] = "torch",
+        runtime: Literal["onnx", "torch"] = "onnx",
     ) -> Controller:
         """Load a controller folder.
 
-        ``runtime`` computes the control steps: torch, or ONNX Runtime, which is quicker for a few robots on a CPU.
+        ``runtime`` computes the control steps: ONNX Runtime on a CPU, or torch on any device.
 
         Raises:
-            ControllerError: if a file is missing, damaged, of another version, or has weights that are not finite;
-                or if the runtime is unknown or not for this device.
+            ControllerError: if a file that the runtime needs is missing, damaged, of another version, or gives targets
+                that are not finite; or if the runtime is unknown or not for this device.
         """
-        if runtime not in ("torch", "onnx"):
-            raise ControllerError(f"there is no runtime {runtime!r}: use 'torch' or 'onnx'")
         folder = Path(folder)
         config, provenance = _FOLDER.read_config(folder, ControllerConfig)
         if config.joint_names != JOINT_NAMES:
             raise ControllerError(f"{folder / CONFIG_FILE} is for a robot with other joints or another joint order")
-        tensors = _FOLDER.read_weights(folder)
-        actor = PilotActor(actor_sizes(), config.network, ~normalised_columns(FRAME))
-        try:
-            pose_tensors = [tensors.pop(f"nominal_pose.{name}").to(device) for name in _POSE_TENSORS]
-        except KeyError as error:
-            raise ControllerError(f"{folder / WEIGHTS_FILE} has no {error}: export the controller again") from error
-        try:
-            actor.load_state_dict(tensors)
-        except RuntimeError as error:
-            first_line = str(error).splitlines()[-1].strip()
-            raise ControllerError(f"{folder / WEIGHTS_FILE} does not fit {CONFIG_FILE}: {first_line}") from error
-        pose = NominalPose(config.pose_axes, *pose_tensors)
-        session = _read_onnx(folder, device) if runtime == "onnx" else None
-        return cls(config, actor, pose, provenance, device, session)
+        if runtime not in ("onnx", "torch"):
+            raise ControllerError(f"there is no runtime {runtime!r}: use 'onnx' or 'torch'")
+        step = _read_onnx(folder, device) if runtime == "onnx" else _read_policy(folder, config, device)
+        controller = cls(config, step, provenance, device)
+        controller.reset(1)
+        if not torch.isfinite(controller.act(*_standing(config, device))).all():
+            raise ControllerError(f"{folder} gives a standing robot targets that are not finite: export it again")
+        controller.reset(1)
+        return controller
 
-    def save(self, folder: Path | str, golden_seed: int = 0) -> None:
-        """Write the folder: JSON, weights, ONNX and golden vectors; each file is complete or absent.
 
-        Raises:
-            ControllerError: if a weight is not finite; nothing is written then.
-        """
-        folder = Path(folder)
-        pose = {f"nominal_pose.{name}": getattr(self.motion.pose, name) for name in _POSE_TENSORS}
-        _FOLDER.write_weights(folder, self.actor.state_dict() | pose)
-        twin = self.twin(GOLDEN_ROBOTS)
-        twin._compute = twin.step  # golden vectors are torch's
-        golden = golden_vectors(twin, self.config.command_space, golden_seed)
-        export_step(twin.step, self.config.command_space, folder / ONNX_FILE)
-        atomic_write(folder / GOLDEN_FILE, lambda file: file.write(json.dumps(golden).encode()))
-        layout = observation_layout()
-        _FOLDER.write_description(folder, self.config, self.provenance, observation_layout=layout)
+def _standing(config: ControllerConfig, device: torch.device | str) -> tuple[Proprioception, Tensor, Tensor, Tensor]:
+    """What a controller is given for one robot that stands as it is told."""
+    command = config.command_space.neutral(device)[None]
+    zeros = torch.zeros(1, 3, device=device)
+    joints = torch.tensor(config.default_position, device=device)[None]
+    measured = Proprioception(joints, torch.zeros_like(joints), zeros, torch.tensor([[0.0, 0.0, -1.0]], device=device))
+    return measured, torch.full((1, MAP_SIZE), 0.76, device=device), command, torch.ones(1, 1, device=device)
+
+
+def save_controller(
+    folder: Path | str, config: ControllerConfig, policy: PolicyConfig, step: ControlStep, provenance: dict[str, Any]
+) -> None:
+    """Write a controller folder: JSON, weights, ONNX and golden vectors; each file is complete or absent.
+
+    Raises:
+        ControllerError: if a weight is not finite; nothing is written then.
+    """
+    folder = Path(folder)
+    pose = {f"nominal_pose.{name}": getattr(step.reference.pose, name) for name in _POSE_TENSORS}
+    _FOLDER.write_weights(folder, step.actor.state_dict() | pose)
+    controller = Controller(config, step, provenance)
+    controller.reset(GOLDEN_ROBOTS)
+    golden = golden_vectors(controller, config.command_space, seed=0)
+    export_step(step, config.command_space, folder / ONNX_FILE)
+    atomic_write(folder / GOLDEN_FILE, lambda file: file.write(json.dumps(golden).encode()))
+    _FOLDER.write_description(
+        folder, config, provenance, policy=asdict(policy), observation_layout=observation_layout()
+    )
 
 
 _POSE_TENSORS = ("values", "roll_limit", "pitch_limits")
+
+
+def build_step(
+    config: ControllerConfig, policy: PolicyConfig, actor: PilotActor, pose: NominalPose, device: torch.device | str
+) -> ControlStep:
+    """The control step of ``actor`` in torch."""
+    scale = torch.tensor(config.action_scale, device=device)
+    gains = Gains(np.array(config.stiffness), np.array(config.damping), np.array(config.action_scale))
+    reference = Reference(policy.reference, gains, config.control_period, device, pose)
+    frozen = actor.to(device).eval().requires_grad_(False)
+    return ControlStep(frozen, reference, config.command_space, scale, config.action_limit)
+
+
+def _read_policy(folder: Path, config: ControllerConfig, device: torch.device | str) -> ControlStep:
+    path = folder / CONFIG_FILE
+    stored = _FOLDER.read_description(folder).get("policy")
+    if stored is None:
+        raise ControllerError(f"{path} describes no policy for torch: use the runtime 'onnx'")
+    try:
+        policy = from_plain(PolicyConfig, stored)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ControllerError(f"{path} is incomplete: {error}") from error
+    tensors = _FOLDER.read_weights(folder)
+    actor = PilotActor(actor_sizes(), policy.network, ~normalised_columns(FRAME))
+    try:
+        pose_tensors = [tensors.pop(f"nominal_pose.{name}").to(device) for name in _POSE_TENSORS]
+    except KeyError as error:
+        raise ControllerError(f"{folder / WEIGHTS_FILE} has no {error}: export the controller again") from error
+    try:
+        actor.load_state_dict(tensors)
+    except RuntimeError as error:
+        first_line = str(error).splitlines()[-1].strip()
+        raise ControllerError(f"{folder / WEIGHTS_FILE} does not fit {CONFIG_FILE}: {first_line}") from error
+    return build_step(config, policy, actor, NominalPose(policy.pose_axes, *pose_tensors), device)
 
 
 def actor_sizes() -> ObservationSizes:
@@ -258,15 +287,12 @@ def actor_sizes() -> ObservationSizes:
 
 def observation_layout() -> list[dict[str, Any]]:
     """Blocks of a proprioceptive frame in order, for whoever ports the controller."""
-    start, layout = 0, []
-    for block in FRAME:
-        layout.append({"name": block.name, "start": start, "stop": start + block.size})
-        start += block.size
-    return layout
+    places = {block.name: columns(FRAME, block.name) for block in FRAME}
+    return [{"name": name, "start": place.start, "stop": place.stop} for name, place in places.items()]
 
 
 def content_hash(folder: Path | str) -> str:
-    """Identity of a controller: SHA-256 over configuration and weights, 16 hexadecimal digits."""
+    """Identity of a controller: SHA-256 over configuration and ONNX file, 16 hexadecimal digits."""
     return _FOLDER.identity(Path(folder))
 
 
@@ -285,3 +311,5 @@ def _read_onnx(folder: Path, device: torch.device | str) -> OnnxStep:
         return OnnxStep(path)
     except (Fail, InvalidArgument, InvalidGraph, InvalidProtobuf) as error:
         raise ControllerError(f"{path} is damaged or truncated: {error}") from error
+    except (KeyError, ValueError) as error:
+        raise ControllerError(f"{path} does not say what its first memory is: export the controller again") from error

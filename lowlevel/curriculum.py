@@ -1,69 +1,90 @@
-"""Adaptive command curriculum (paper III-B-5): ranges open in stages, driven by measured tracking."""
+"""Command curriculum (paper III-B-5): every kind of command opens as far as it is tracked, and is drawn by its error.
+
+The paper opens its ranges one after the other. Here each kind of command (:data:`lowlevel.commands.KINDS`) has an
+opening of its own, and kinds that are tracked badly are drawn more often, down to a floor for all others.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 
-from lowlevel.commands import CommandRange
+import torch
+from torch import Tensor
 
+from lowlevel.commands import KINDS
+from lowlevel.distributed import sum_over_ranks
 
-@dataclass(frozen=True)
-class Stage:
-    """One command group of the curriculum."""
-
-    name: str
-    """Field of :class:`CommandRange` that the stage opens."""
-    reward: str
-    """Reward term whose mean measures the stage's tracking."""
-    threshold: float
-    """Mean of that (unweighted) term above which the range may grow."""
-
-
-STAGES: tuple[Stage, ...] = (
-    Stage("velocity", "linear_velocity", 0.45),
-    Stage("height", "base_height", 0.60),
-    Stage("torso", "torso_orientation", 0.45),
-    Stage("arms", "upper_body_position", 0.30),
-)
-"""In the paper's order: locomotion, then height, then torso attitude, then arms."""
+QUALITY_TERMS = ("linear_velocity", "angular_velocity", "base_height", "torso_orientation")
+"""Reward terms in [0, 1] whose mean is the quality of tracking."""
 
 
 @dataclass(frozen=True)
 class CurriculumConfig:
-    """Where the ranges start and how they grow."""
+    """How kinds open and how often they are drawn."""
 
-    start: CommandRange = field(default_factory=lambda: CommandRange(velocity=0.5, height=0.5, torso=0.5, arms=0.1))
-    """Opening of each range at the start; small instead of zero, so that no input is constant."""
-    growth: float = 0.008
-    """Largest growth of a factor per update."""
-    required_opening: float = 0.6
-    """A stage grows only when the stage before it is open at least this far."""
-    survival: float = 0.3
-    """Mean episode length, as a share of the longest, below which nothing grows."""
+    start: float = 0.3
+    """Opening of every kind at the start; not zero, so that no input is constant."""
+    growth: float = 0.006
+    """Growth of an opening per update."""
+    quality: float = 0.45
+    """Quality of tracking above which a kind may grow, under the noise of exploration."""
+    steps_between_falls: float = 300.0
+    """Control steps of a kind per fall above which it may grow."""
+    smoothing: float = 0.1
+    """Weight of the last update in the measured averages."""
+    most_often: float = 2.0
+    """Largest factor by which its error makes a kind more frequent than its share, or less."""
 
 
 class Curriculum:
-    """Holds the opening of every command range and advances it from measured tracking."""
+    """Measured tracking of each kind, and what follows from it. Tensors have one entry per kind."""
 
     def __init__(self, config: CurriculumConfig) -> None:
         self.config = config
-        self.open_range = config.start
+        count = len(KINDS)
+        self.opening = torch.full((count,), config.start)
+        self.quality = torch.zeros(count)
+        self.fall_rate = torch.full((count,), 0.05)
+        """Falls per control step."""
+        self._sums = torch.zeros(3, count)
 
-    def update(self, mean_terms: dict[str, float], survival: float) -> None:
-        """Advance from the mean reward terms of an iteration and the share of an episode that robots survive."""
-        if survival < self.config.survival:
-            return
-        opening = asdict(self.open_range)
-        previous = 1.0
-        for stage in STAGES:
-            may_grow = previous >= self.config.required_opening
-            if may_grow and mean_terms[stage.reward] > stage.threshold:
-                opening[stage.name] = min(1.0, opening[stage.name] + self.config.growth)
-            previous = opening[stage.name]
-        self.open_range = CommandRange(**opening)
+    def observe(self, kind: Tensor, terms: dict[str, Tensor], fallen: Tensor) -> None:
+        """Count one step of N robots: their ``kind`` (N,), unweighted reward ``terms`` and falls (N,)."""
+        quality = torch.stack([terms[name] for name in QUALITY_TERMS]).mean(dim=0)
+        for row, values in zip(self._sums, (torch.ones_like(quality), quality, fallen.float()), strict=True):
+            row.index_add_(0, kind.cpu(), values.cpu())
 
-    def state_dict(self) -> dict[str, float]:
-        return asdict(self.open_range)
+    def update(self) -> None:
+        """Take in what was observed since the last update, over all ranks, and open what is tracked."""
+        config = self.config
+        steps, quality, falls = sum_over_ranks(self._sums)
+        seen = steps > 0
+        weight = config.smoothing * seen
+        self.quality += weight * (quality / steps.clamp_min(1.0) - self.quality)
+        self.fall_rate += weight * (falls / steps.clamp_min(1.0) - self.fall_rate)
+        tracked = (self.quality > config.quality) & (self.fall_rate * config.steps_between_falls < 1.0)
+        self.opening = (self.opening + config.growth * (seen & tracked)).clamp_max(1.0)
+        self._sums = torch.zeros_like(self._sums)
 
-    def load_state_dict(self, state: dict[str, float]) -> None:
-        self.open_range = CommandRange(**state)
+    def probabilities(self, shares: Tensor) -> Tensor:
+        """Chance of each kind: its share (kinds,), more often where tracking lacks more."""
+        lack = (1.0 - self.quality).clamp_min(0.05)
+        mean = (shares * lack).sum()
+        factor = (lack / mean).clamp(1.0 / self.config.most_often, self.config.most_often)
+        return shares * factor / (shares * factor).sum()
+
+    def figures(self, shares: Tensor) -> dict[str, float]:
+        """Openings, qualities and falls of the kinds that are drawn, by name."""
+        result = {}
+        for number, name in enumerate(KINDS):
+            if shares[number] > 0.0:
+                result[f"opening/{name}"] = float(self.opening[number])
+                result[f"quality/{name}"] = float(self.quality[number])
+                result[f"steps_between_falls/{name}"] = float(1.0 / self.fall_rate[number].clamp_min(1e-6))
+        return result
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"opening": self.opening, "quality": self.quality, "fall_rate": self.fall_rate}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.opening, self.quality, self.fall_rate = (state[name].clone() for name in self.state_dict())

@@ -15,6 +15,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from robots.errors import PilotError
+
 
 def start(device: str = "cpu") -> torch.device:
     """Join the process group that ``torchrun`` describes in the environment and return this rank's device.
@@ -23,17 +25,17 @@ def start(device: str = "cpu") -> torch.device:
     NCCL, one GPU per local rank, and CPU tensors over gloo.
 
     Raises:
-        ValueError: if ``WORLD_SIZE`` is not an integer, or ``device`` is unknown or not there.
+        PilotError: if ``WORLD_SIZE`` is not an integer, or ``device`` is unknown or not there.
     """
     try:
         chosen = torch.device(device)
     except RuntimeError as error:
-        raise ValueError(f"unknown device {device!r}; use 'cpu' or 'cuda'") from error
+        raise PilotError(f"unknown device {device!r}; use 'cpu' or 'cuda'") from error
     if chosen.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError("a CUDA device was asked for but PyTorch finds none; use device 'cpu'")
+        raise PilotError("a CUDA device was asked for but PyTorch finds none; use device 'cpu'")
     announced = os.environ.get("WORLD_SIZE", "1")
     if not announced.isdigit():
-        raise ValueError(f"WORLD_SIZE is {announced!r} but must be the number of processes; start with torchrun")
+        raise PilotError(f"WORLD_SIZE is {announced!r} but must be the number of processes; start with torchrun")
     if int(announced) > 1 and chosen.type == "cuda":
         chosen = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(chosen)

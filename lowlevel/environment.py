@@ -3,45 +3,51 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import Annotated, TypeVar
 
 import torch
+import tyro
 from torch import Tensor
 
 from lowlevel.buffers import Buffers
 from lowlevel.commands import (
-    ARMS,
     HEIGHT,
-    POSTURE,
+    KINDS,
+    PROTOCOL,
     TORSO,
     VELOCITY,
-    CommandMixture,
-    CommandRange,
     CommandSampler,
+    Mixture,
     command_space,
+    shares,
 )
-from lowlevel.measures import Measurement, has_fallen, height_error, torso_error
-from lowlevel.nominal import NominalMotion
-from lowlevel.nominal_config import NominalConfig
-from lowlevel.nominal_state import NominalState
+from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
+from lowlevel.measures import Measurement, height_error, is_lost, torso_error
 from lowlevel.observation import (
     PRIVILEGED_SIZE,
     FrameBuilder,
     NoiseConfig,
     push_history,
-    split_frame,
     start_history,
 )
 from lowlevel.randomization import RandomizationConfig, Randomizer
+from lowlevel.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
-from lowlevel.rotations import about_axis, multiply
+from lowlevel.rotations import about_axis, multiply, rotate_about_vertical
 from lowlevel.simulation import BatchSimulation
 from lowlevel.snapshot import Snapshot, take_snapshot, with_rows
 from lowlevel.terrain import STANCE_REACH, Terrain, TerrainConfig
-from robots.g1.constants import ARM_JOINTS, LOWER_JOINTS, NUM_JOINTS, WAIST_JOINTS, gain_set
+from robots.errors import PilotError
+from robots.g1.constants import ARM_JOINTS, NUM_JOINTS, WAIST_JOINTS, gain_set
 from robots.g1.model import ModelOptions, build_spec
 
 MAP_REFRESH_STEPS = 5
 """Control steps between refreshes of the elevation map: 10 Hz at 50 Hz control (paper IV-B)."""
+
+
+Value = TypeVar("Value")
+FromStage = Annotated[Value, tyro.conf.Suppress]
+"""A field that is no option of a command line, because the stages of a run decide it."""
 
 
 @dataclass(frozen=True)
@@ -60,22 +66,27 @@ class EnvironmentConfig:
     """PD gain set, a key of robots.g1.constants.GAINS."""
     episode_length: float = 10.0
     """Longest episode [s]."""
-    command_interval: tuple[float, float] = (4.0, 8.0)
+    command_interval: tuple[float, float] = (2.0, 6.0)
     """Time between new commands, uniform [s]."""
     start_in_posture: float = 0.25
     """Share of episodes that start in the commanded posture instead of standing upright."""
-    action_limit: float = 8.0
-    """Actions are clipped to +- this many action scales."""
-    nominal: NominalConfig = field(default_factory=NominalConfig)
-    mixture: CommandMixture = field(
-        default_factory=lambda: CommandMixture(walk_and_work=0.35, stand_and_work=0.4, stand=0.1, slow=0.25)
-    )
-    """Unlike the evaluation it also stands in the neutral posture, what a planner starts from and stops in, and walks
-    slowly."""
-    terrain: TerrainConfig = field(default_factory=TerrainConfig)
+    start_moving: float = 0.3
+    """Share of episodes that start at the commanded velocity."""
+    action_limit: float = 12.0
+    """Actions are clipped to +- this many action scales; the lift of a knee takes 7."""
+    prior: GaitPriorConfig = field(default_factory=GaitPriorConfig)
+    reference: ReferenceConfig = field(default_factory=ReferenceConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
-    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
-    rewards: RewardWeights = field(default_factory=RewardWeights)
+    # What the stages of a training run set (lowlevel.stages)
+    arms_act: FromStage[bool] = True
+    """Whether the policy corrects the arms too; their targets are the slewed command otherwise."""
+    gait_prior: FromStage[float] = 0.0
+    """Weight of the gait prior; 0 in everything that is evaluated or deployed."""
+    mixture: FromStage[Mixture] = PROTOCOL
+    """Kinds of command and their shares."""
+    terrain: FromStage[TerrainConfig] = field(default_factory=TerrainConfig)
+    randomization: FromStage[RandomizationConfig] = field(default_factory=RandomizationConfig)
+    rewards: FromStage[RewardWeights] = field(default_factory=RewardWeights)
 
 
 @dataclass(frozen=True)
@@ -95,6 +106,8 @@ class StepResult:
     """Before resets."""
     command: Tensor
     """The clamped command that the step tracked (N, 21)."""
+    kind: Tensor
+    """Number of its kind in KINDS (N,)."""
 
 
 class PilotEnvironment:
@@ -108,12 +121,12 @@ class PilotEnvironment:
 
     def __init__(self, config: EnvironmentConfig, seed: int = 0, device: torch.device | str = "cpu") -> None:
         if abs(config.timestep * config.decimation - 0.02) > 1e-9:
-            raise ValueError(
+            raise PilotError(
                 f"timestep {config.timestep} s times decimation {config.decimation} is not the control period 0.02 s"
             )
         for name in ("num_robots", "num_threads"):
             if getattr(config, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(config, name)}")
+                raise PilotError(f"{name} must be at least 1, not {getattr(config, name)}")
         self.config = config
         self.device = torch.device(device)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
@@ -128,12 +141,16 @@ class PilotEnvironment:
         self.max_steps = round(config.episode_length / self.control_period)
         lower, upper = self.simulation.joint_lower, self.simulation.joint_upper
         self.command_space = command_space(lower.tolist(), upper.tolist())
-        self.sampler = CommandSampler(self.command_space, config.mixture, device)
-        self.motion = NominalMotion(config.nominal, gains, self.control_period, device)
+        self.sampler = CommandSampler(self.command_space, device)
+        self.reference = Reference(config.reference, gains, self.control_period, device)
+        self.prior = GaitPrior(config.prior, device)
         self.action_scale = torch.tensor(gains.action_scale, dtype=torch.float32, device=device)
-        self.build_frame = FrameBuilder(self.command_space, self.motion, device)
+        self.build_frame = FrameBuilder(self.command_space, self.reference, device)
         self.randomizer = Randomizer(config.randomization, self.simulation, self.generator)
-        self.open_range = CommandRange()
+        self.kind_probability = shares(config.mixture, device)
+        """Chance of each kind of command (kinds,); the curriculum moves it."""
+        self.opening = torch.ones(len(KINDS), device=device)
+        """How far each kind is open (kinds,), in [0, 1]; the curriculum moves it."""
         self._noise = config.noise.frame_amplitude().to(device)
         self._step_count = 0
         neutral = self.command_space.neutral(self.device)
@@ -156,65 +173,54 @@ class PilotEnvironment:
             self.buffers.episode_step = torch.randint(
                 self.max_steps, (self.num_robots,), generator=self.generator, device=self.device
             )
-        self._advance_nominal()
+        self._advance_reference()
         now = take_snapshot(self.simulation.read(), self.terrain)
-        self.buffers.velocity = now.measured.linear_velocity
         return self._observe(now, everyone)
 
-    def step(self, action: Tensor, estimated_velocity: Tensor | None = None) -> StepResult:
-        """Apply residual ``action`` (N, 29) for one control step of 0.02 s.
-
-        ``estimated_velocity`` (N, 3) [m/s]: the policy's estimate of the base velocity in the heading frame, which
-        the nominal motion steers by; the true one by default.
-        """
+    def step(self, action: Tensor) -> StepResult:
+        """Apply residual ``action`` (N, 29), in action scales, for one control step of 0.02 s."""
         buffers = self.buffers
-        velocity = buffers.velocity if estimated_velocity is None else estimated_velocity
         action = action.clamp(-self.config.action_limit, self.config.action_limit)
-        frame = split_frame(buffers.history[:, -1])
-        nominal_target, buffers.nominal = self.motion.joint_targets(
-            buffers.nominal,
-            frame["joint_position"] + self.motion.default,
-            frame["projected_gravity"],
-            frame["base_angular_velocity"],
-            velocity,
-        )
+        if not self.config.arms_act:
+            action[:, ARM_JOINTS] = 0.0
+        nominal_target = self.reference.joint_targets(buffers.reference)
         target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
-        applied = torch.where(self.randomizer.state.is_delayed, buffers.previous_target, target)
-        buffers.previous_target = target
-        self.simulation.step(applied)
+        if self.config.gait_prior > 0.0:
+            target = target + self.config.gait_prior * self.prior(buffers.reference)
+        self.simulation.step(self.randomizer.delayed(target))
 
         now = take_snapshot(self.simulation.read(), self.terrain)
         measured = now.measured
         buffers.previous_action, buffers.action = buffers.action, action
         buffers.episode_step += 1
         self._update_foot_times(measured)
-        fallen = has_fallen(measured, buffers.nominal.reference) | self.simulation.diverged()
+        fallen = is_lost(measured, buffers.reference.command) | self.simulation.diverged()
         truncated = (buffers.episode_step >= self.max_steps) & ~fallen
         transition = Transition(
             measured=measured,
-            command=buffers.tracked_command,
+            command=self._tracked_command,
             flag=buffers.flag,
             action=action,
             previous_action=buffers.previous_action,
             nominal_target=nominal_target,
-            phase=buffers.nominal.phase,
-            walking=buffers.nominal.walking,
+            phase=buffers.reference.phase,
+            walking=buffers.reference.walking,
+            gait_frequency=self.config.reference.gait_frequency,
             foot_air_time=buffers.foot_air_time,
             foot_contact_time=buffers.foot_contact_time,
             fallen=fallen,
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
-        command = buffers.command
+        command, kind = buffers.command, buffers.kind.clone()
         next_privileged = self._privileged(now, self._frame(measured), transition.torso_error)
 
         done = torch.nonzero(fallen | truncated)[:, 0]
         if len(done):
             self._reset_robots(done)
             now = with_rows(now, done, take_snapshot(self.simulation.read(done), self.terrain))
-        buffers.velocity = now.measured.linear_velocity
         buffers.hand_force = self.randomizer.disturb(now.measured.robot, now.measured.heading)
         self._resample_due_commands()
-        self._advance_nominal()
+        self._advance_reference()
         self._step_count += 1
         return StepResult(
             observation=self._observe(now, done),
@@ -225,21 +231,25 @@ class PilotEnvironment:
             terms=terms,
             measured=measured,
             command=command,
+            kind=kind,
         )
 
-    def set_command(self, ids: Tensor, command: Tensor, flag: Tensor, hold: float = float("inf")) -> None:
-        """Give robots ``ids`` (n,) a ``command`` (n, 21), clamped here, for ``hold`` seconds."""
+    def set_command(self, ids: Tensor, command: Tensor, flag: Tensor) -> None:
+        """Give robots ``ids`` (n,) a ``command`` (n, 21), clamped here, until it is set again."""
         self.buffers.command = self.buffers.command.clone()
-        self.buffers.command[ids] = self.motion.clamp(command)
+        self.buffers.command[ids] = self.reference.clamp(command)
         self.buffers.flag[ids] = flag
-        self.buffers.command_countdown[ids] = hold
+        self.buffers.command_countdown[ids] = torch.inf
 
     # -- parts of a step --------------------------------------------------------------------------------------
 
-    def _advance_nominal(self) -> None:
-        buffers = self.buffers
-        buffers.nominal = self.motion.advance(buffers.nominal, buffers.command)
-        buffers.tracked_command = self.motion.tracked_command(buffers.nominal, buffers.command)
+    @property
+    def _tracked_command(self) -> Tensor:
+        """What the policy is rewarded for (N, 21): the command, of whose velocity the slewed part is due by now."""
+        return torch.cat([self.buffers.reference.command[:, VELOCITY], self.buffers.command[:, HEIGHT:]], dim=1)
+
+    def _advance_reference(self) -> None:
+        self.buffers.reference = self.reference.advance(self.buffers.reference, self.buffers.command)
 
     def _update_foot_times(self, measured: Measurement) -> None:
         contact, period = measured.foot_contact, self.control_period
@@ -253,8 +263,10 @@ class PilotEnvironment:
             self._sample_commands(due)
 
     def _sample_commands(self, ids: Tensor) -> None:
-        command, flag = self.sampler.sample(len(ids), self.open_range, self.generator)
+        kinds = self.sampler.draw_kinds(len(ids), self.kind_probability, self.generator)
+        command, flag = self.sampler.sample(kinds, self.opening, self.generator)
         self.set_command(ids, command, flag)
+        self.buffers.kind[ids] = kinds
         self.buffers.command_countdown[ids] = self._uniform(*self.config.command_interval, len(ids))
 
     def _reset_robots(self, ids: Tensor) -> None:
@@ -262,25 +274,18 @@ class PilotEnvironment:
         buffers, count = self.buffers, len(ids)
         self._sample_commands(ids)
         in_posture = self._uniform(0.0, 1.0, count, 1) < self.config.start_in_posture
-        neutral = self.sampler.neutral.expand(count, -1)
-        reference = torch.where(in_posture, buffers.command[ids], neutral).clone()
-        reference[:, VELOCITY] = 0.0
-        standing = NominalState.standing(reference, self.config.nominal.settling_time)
-        for remembered, fresh in zip(buffers.nominal, standing, strict=True):
+        moving = self._uniform(0.0, 1.0, count, 1) < self.config.start_moving
+        posture = torch.where(in_posture, buffers.command[ids], self.sampler.neutral)
+        velocity = buffers.command[ids, VELOCITY] * moving
+        reference = torch.cat([velocity, posture[:, HEIGHT:]], dim=1)
+        for remembered, fresh in zip(buffers.reference, ReferenceState.standing(reference), strict=True):
             remembered[ids] = fresh
 
         heading = self._uniform(-torch.pi, torch.pi, count)
-        facing = about_axis(2, heading)
-        joint_position = self.motion.default.repeat(count, 1)
-        joint_position[:, ARM_JOINTS] = reference[:, ARMS]
-        if self.config.nominal.kind == "default":
-            height = neutral[:, HEIGHT]
-            orientation = facing
-        else:
-            height = reference[:, HEIGHT]
-            joint_position[:, LOWER_JOINTS] = self.motion.pose.lookup(reference[:, POSTURE])[0]
-            waist = joint_position[:, WAIST_JOINTS]
-            orientation = multiply(facing, self.motion.pelvis_attitude(reference[:, TORSO], waist))
+        joint_position = self.reference.standing_joints(reference)
+        attitude = self.reference.pelvis_attitude(reference[:, TORSO], joint_position[:, WAIST_JOINTS])
+        orientation = multiply(about_axis(2, heading), attitude)
+        height = reference[:, HEIGHT]
         joint_position += self._uniform(-0.02, 0.02, count, NUM_JOINTS)
 
         tile = torch.randint(len(self.terrain.tile_centers), (count,), generator=self.generator, device=self.device)
@@ -291,11 +296,12 @@ class PilotEnvironment:
         base_velocity = torch.zeros(count, 6, device=self.device)
         fastest = self.config.randomization.start_velocity
         base_velocity[:, :3] = self._uniform(-fastest, fastest, count, 3)
+        base_velocity[:, :2] += rotate_about_vertical(heading, velocity[:, :2])
         self.simulation.reset(ids, base_position, orientation, joint_position, base_velocity)
-        self.randomizer.draw(ids, self.open_range.arms)
+        self.randomizer.draw(ids)
         self.simulation.forward(ids)
 
-        buffers.previous_target[ids] = joint_position
+        self.randomizer.start(ids, joint_position)
         buffers.action[ids], buffers.previous_action[ids] = 0.0, 0.0
         buffers.foot_air_time[ids], buffers.foot_contact_time[ids] = 0.0, 0.0
         buffers.episode_step[ids] = 0
@@ -309,9 +315,9 @@ class PilotEnvironment:
             robot.joint_velocity,
             robot.base_angular_velocity,
             measured.projected_gravity,
-            buffers.tracked_command,
+            buffers.command,
             buffers.action,
-            buffers.nominal,
+            buffers.reference,
         )
 
     def _observe(self, now: Snapshot, new_episodes: Tensor) -> dict[str, Tensor]:
@@ -331,7 +337,7 @@ class PilotEnvironment:
             "history": buffers.history.flatten(1),
             "elevation_map": buffers.elevation,
             "flag": buffers.flag.clone(),
-            "privileged": self._privileged(now, exact_frame, torso_error(now.measured, buffers.tracked_command)),
+            "privileged": self._privileged(now, exact_frame, torso_error(now.measured, buffers.command)),
         }
 
     def _noisy(self, elevation: Tensor) -> Tensor:
@@ -342,7 +348,7 @@ class PilotEnvironment:
         parts = (
             measured.linear_velocity,
             exact_frame,
-            height_error(measured, buffers.tracked_command)[:, None],
+            height_error(measured, buffers.command)[:, None],
             torso_error,
             now.feet,
             buffers.hand_force.flatten(1) / 20.0,
@@ -361,8 +367,8 @@ class PilotEnvironment:
         """Everything needed to continue bit-exactly on a CPU."""
         return {
             "simulation": self.simulation.state_dict(),
-            "buffers": {f.name: getattr(self.buffers, f.name) for f in fields(Buffers) if f.name != "nominal"},
-            "nominal": self.buffers.nominal._asdict(),
+            "buffers": {f.name: getattr(self.buffers, f.name) for f in fields(Buffers) if f.name != "reference"},
+            "reference": self.buffers.reference._asdict(),
             "randomization": {f.name: getattr(self.randomizer.state, f.name) for f in fields(self.randomizer.state)},
             "generator": self.generator.get_state(),
             "step_count": self._step_count,
@@ -373,7 +379,7 @@ class PilotEnvironment:
         self.simulation.load_state_dict(state["simulation"])
         for name, value in state["buffers"].items():
             setattr(self.buffers, name, value.clone())
-        self.buffers.nominal = NominalState(**{name: value.clone() for name, value in state["nominal"].items()})
+        self.buffers.reference = ReferenceState(**{name: value.clone() for name, value in state["reference"].items()})
         for name, value in state["randomization"].items():
             setattr(self.randomizer.state, name, value.clone())
         self.generator.set_state(state["generator"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +9,19 @@ from typing import Any
 import torch
 import tyro
 
-from lowlevel.controller import Controller, ControllerConfig, actor_sizes
+from lowlevel.command_line import command_line
+from lowlevel.commands import KINDS
+from lowlevel.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
 from lowlevel.environment import PilotEnvironment
-from lowlevel.networks import NetworkConfig, PilotActor
+from lowlevel.networks import PilotActor
 from lowlevel.observation import FRAME, normalised_columns
 from lowlevel.provenance import find_state, git_revision, read_run_description, read_training_config
 from lowlevel.trainer import Trainer
-from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
+from robots.errors import PilotError
+from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, GAINS, JOINT_NAMES
 
 
-def controller_config(environment: PilotEnvironment, network: NetworkConfig) -> ControllerConfig:
+def controller_config(environment: PilotEnvironment) -> ControllerConfig:
     """The conventions of an environment, as a controller carries them."""
     gains = GAINS[environment.config.gains]
     return ControllerConfig(
@@ -33,34 +35,36 @@ def controller_config(environment: PilotEnvironment, network: NetworkConfig) -> 
         action_limit=environment.config.action_limit,
         control_period=environment.control_period,
         command_space=environment.command_space,
-        nominal=environment.config.nominal,
-        network=network,
-        pose_axes=environment.motion.pose.axes,
     )
 
 
-def freeze(trainer: Trainer, revision: str | None = None) -> Controller:
-    """The current policy of a run as a controller on the CPU, detached from the run.
+def export_controller(trainer: Trainer, folder: Path, revision: str | None = None) -> None:
+    """Freeze the current policy of ``trainer`` into a controller ``folder``.
 
     ``revision`` of the code that trained it: this one by default.
+
+    Raises:
+        PilotError: if the run is in a stage with a gait prior, which no controller has.
     """
-    config = controller_config(trainer.environment, trainer.config.network)
-    actor = PilotActor(actor_sizes(), config.network, ~normalised_columns(FRAME))
+    if trainer.stage.gait_prior > 0.0:
+        raise PilotError(f"the policy still leans on the gait prior in the stage {trainer.stage.name!r}: train on")
+    environment = trainer.environment
+    config, pose = controller_config(environment), environment.reference.pose
+    policy = PolicyConfig(environment.config.reference, trainer.config.network, pose.axes)
+    actor = PilotActor(actor_sizes(), policy.network, ~normalised_columns(FRAME))
     actor.load_state_dict({name: tensor.cpu() for name, tensor in trainer.ppo.actor.state_dict().items()})
+    if not trainer.stage.arms_act:
+        actor.silence(ARM_JOINTS)
     provenance: dict[str, Any] = {
         "training": asdict(trainer.config),
         "steps": trainer.steps,
         "hours": trainer.trained_seconds / 3600.0,
-        "curriculum": trainer.curriculum.state_dict(),
+        "stage": trainer.stage.name,
+        "curriculum": trainer.curriculum.figures(torch.ones(len(KINDS))),
         "revision": git_revision() if revision is None else revision,
         "torch": torch.__version__,
     }
-    return Controller(config, actor, trainer.environment.motion.pose, provenance)
-
-
-def export_controller(trainer: Trainer, folder: Path, revision: str | None = None) -> None:
-    """Freeze the current policy of ``trainer`` into a controller ``folder``; ``revision`` as in :func:`freeze`."""
-    freeze(trainer, revision).save(folder)
+    save_controller(folder, config, policy, build_step(config, policy, actor, pose, "cpu"), provenance)
 
 
 def export_run(run: Path, controller: Path) -> None:
@@ -75,7 +79,5 @@ def export_run(run: Path, controller: Path) -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with command_line("lowlevel.export", "interrupted"):
         tyro.cli(export_run)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"lowlevel.export: {error}")

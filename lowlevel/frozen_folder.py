@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lowlevel.files import atomic_write
 from lowlevel.plain import from_plain
+from robots.errors import PilotError
 
 Config = TypeVar("Config")
 
@@ -31,7 +32,9 @@ class FrozenFolder:
     weights_file: str
     example: str
     """Where folders of this kind are found."""
-    error: type[ValueError]
+    error: type[PilotError]
+    identity_file: str
+    """The file that makes out the identity together with the configuration."""
 
     def read_description(self, folder: Path) -> dict[str, Any]:
         """Contents of the description, of whatever version."""
@@ -97,10 +100,10 @@ class FrozenFolder:
         self._write(folder, description | {"provenance": description["provenance"] | entries})
 
     def identity(self, folder: Path) -> str:
-        """SHA-256 over configuration and weights, 16 hexadecimal digits."""
+        """SHA-256 over configuration and :attr:`identity_file`, 16 hexadecimal digits."""
         digest = hashlib.sha256()
         digest.update(json.dumps(self.read_description(folder)["config"], sort_keys=True).encode())
-        digest.update((folder / self.weights_file).read_bytes())
+        digest.update((folder / self.identity_file).read_bytes())
         return digest.hexdigest()[:16]
 
     def _write(self, folder: Path, description: dict[str, Any]) -> None:

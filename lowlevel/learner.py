@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +29,7 @@ from lowlevel.networks import (
     TargetEncoder,
 )
 from lowlevel.symmetry import TensorMirrors
+from robots.errors import PilotError
 
 ACTOR_KEYS = ("history", "elevation_map", "flag")
 """What the policy sees."""
@@ -40,11 +41,8 @@ POLICY_KEYS = ("frame", "elevation_map", "flag", "velocity", "latent")
 class PPOConfig:
     """Settings of the learner."""
 
-    steps_per_update: int = 12
+    steps_per_update: int = 24
     """Control steps per robot and update, at first."""
-    rollout_doublings: int = 2
-    """How often that number doubles over a run, after equal shares of it. Many small updates learn faster from
-    scratch; the better the policy, the more samples it takes to see what would improve it."""
     epochs: int = 4
     """Passes over the rollout per update."""
     minibatches: int = 4
@@ -55,65 +53,37 @@ class PPOConfig:
     """Decay of the generalised advantage estimate."""
     clip: float = 0.2
     """Clipping range of the probability ratio."""
-    desired_kl: float = 0.015
+    desired_kl: float = 0.01
     """KL divergence from the acting policy that steers the actor's learning rate [nat]; 0 keeps the rate."""
-    actor_learning_rate: float = 3e-4
+    actor_learning_rate: float = 1e-3
     """First learning rate of the actor; a run that continues another one keeps that one's."""
     actor_learning_rate_bounds: tuple[float, float] = (1e-5, 2e-3)
     """Range of the actor's adaptive learning rate."""
     critic_learning_rate: float = 5e-4
     """Learning rate of the critic."""
-    estimator_epochs: int = 1
-    """Passes in which the estimator learns too; as a supervised learner it needs fewer."""
     estimator_learning_rate: float = 5e-4
     """Learning rate of the history encoder, the next-state encoder and the prototypes."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus [1/nat]."""
-    initial_std: float = 0.25
-    """First standard deviation of the exploration noise [action units]; a run that continues another one keeps that
-    one's where it is lower."""
-    final_std: float = 0.05
-    """Standard deviation that the noise may have at most at the end of a run [action units]; the bound falls to it from
-    ``initial_std`` by the same factor in every step. The less noise, the nearer is what the policy is paid for to what
-    it does without."""
-    std_bounds: tuple[float, float] = (0.05, 1.0)
-    """Range of the exploration noise [action units]."""
-    noise_correlation: float = 0.0
-    """Correlation of the exploration noise with that of the control step before, in [0, 1). White noise averages out
-    over a stride; correlated noise shows what leaning on for longer does (Hollenstein et al., AAAI 2024). PPO goes on
-    as if the noise were white."""
+    initial_std: float = 0.8
+    """First standard deviation of the exploration noise [action units]; the stages of a run bound it."""
     max_grad_norm: float = 1.0
     """Gradient norm to which each of the three groups is clipped."""
-    symmetry: Literal["none", "augmentation", "loss"] = "loss"
-    """Penalise an asymmetric policy ("loss"), and also mirror half of every minibatch ("augmentation")."""
-    mirror_loss_weight: float = 0.5
-    """Weight of the symmetry loss, the KL divergence between the policy and its mirror image [1/nat]."""
+    mirror_loss_weight: float = 0.1
+    """Weight of the symmetry loss, the KL divergence between the policy and its mirror image [1/nat]; 0: none."""
     mirror_loss_share: float = 0.25
     """Share of a minibatch on which the symmetry loss is taken."""
-    autocast: bool = False
-    """Compute hidden layers in bfloat16; for GPUs, on CPUs it was measured to be slower than float32."""
     estimation: EstimationConfig = field(default_factory=EstimationConfig)
     """Weights of the estimator loss."""
 
     def __post_init__(self) -> None:
         for name in ("steps_per_update", "epochs", "minibatches"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.rollout_doublings < 0:
-            raise ValueError(f"rollout_doublings must not be negative, but it is {self.rollout_doublings}")
-        if not 0 < self.estimator_epochs <= self.epochs:
-            raise ValueError(f"estimator_epochs {self.estimator_epochs} is not between 1 and epochs {self.epochs}")
-        if self.symmetry not in ("none", "augmentation", "loss"):
-            raise ValueError(f"symmetry must be none, augmentation or loss, not {self.symmetry!r}")
-        low, high = self.std_bounds
+                raise PilotError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0 < self.mirror_loss_share <= 0.5:
-            raise ValueError(f"mirror_loss_share {self.mirror_loss_share} is not between 0 and 0.5")
-        if not 0.0 <= self.noise_correlation < 1.0:
-            raise ValueError(f"noise_correlation {self.noise_correlation} is not at least 0 and below 1")
-        if not 0 < low <= self.initial_std <= high:
-            raise ValueError(f"initial_std {self.initial_std} is outside std_bounds {self.std_bounds}")
-        if not 0 < self.final_std <= self.initial_std:
-            raise ValueError(f"final_std {self.final_std} is not above 0 and at most initial_std {self.initial_std}")
+            raise PilotError(f"mirror_loss_share {self.mirror_loss_share} is not between 0 and 0.5")
+        if self.initial_std <= 0.0:
+            raise PilotError(f"initial_std {self.initial_std} is not above 0")
 
 
 def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, clip: float) -> Tensor:
@@ -153,6 +123,10 @@ class Learner:
         self.actor = PilotActor(sizes, network_config, command_columns, config.initial_std).to(device)
         self.critic = Critic(sizes, network_config, privileged_command_columns).to(device)
         self.target_encoder = TargetEncoder(sizes, network_config, privileged_command_columns).to(device)
+        self.acting = slice(0, sizes.action)
+        """The actions that take part: the others are neither explored nor learned."""
+        self.std_bounds = (1e-6, math.inf)
+        """Range of the exploration noise [action units]."""
         self._modules = {"actor": self.actor, "critic": self.critic, "target_encoder": self.target_encoder}
         for module in self._modules.values():
             broadcast([*module.parameters(), *module.buffers()])
@@ -172,14 +146,9 @@ class Learner:
         """Current learning rate of the actor."""
         return float(self.optimizers["actor"].param_groups[0]["lr"])
 
-    def autocast(self) -> torch.autocast:
-        """The context in which networks are evaluated."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.autocast)
-
     def policy(self, observation: Mapping[str, Tensor]) -> ActorOutput:
         """Evaluate the actor on raw observations."""
-        with self.autocast():
-            return self.actor(*(observation[key] for key in ACTOR_KEYS))
+        return self.actor(*(observation[key] for key in ACTOR_KEYS))
 
     def distribution(self, mean: Tensor) -> Normal:
         """The exploration noise around ``mean`` (N, A)."""
@@ -187,55 +156,40 @@ class Learner:
 
     def log_prob(self, mean: Tensor, action: Tensor) -> Tensor:
         """Log-probability (N,) of ``action`` (N, A) under the noise around ``mean`` (N, A)."""
-        return self.distribution(mean).log_prob(action).sum(dim=1)
+        return self.distribution(mean).log_prob(action)[:, self.acting].sum(dim=1)
 
     def losses(
-        self,
-        samples: Mapping[str, Tensor],
-        mirrored: int,
-        images: Mapping[str, Tensor] | None,
-        old_std: Tensor,
-        estimating: bool,
+        self, samples: Mapping[str, Tensor], images: Mapping[str, Tensor] | None, old_std: Tensor, estimating: bool
     ) -> dict[str, Tensor]:
         """Losses "actor", "critic" and, if ``estimating``, "estimator", with figures to log; all scalars.
 
-        ``samples``: B rows per name. The first ``mirrored`` of them are mirror images, which the KL
-        divergence leaves out. ``images``: mirror images of the last rows, for the symmetry loss.
+        ``samples``: B rows per name. ``images``: mirror images of the last rows, for the symmetry loss.
         ``old_std`` (A,) is the noise of the policy that acted.
         """
-        losses = self._actor_losses(samples, mirrored, images, old_std)
-        with self.autocast():
-            value = self.critic(samples["privileged"])
-        losses["critic"] = (value - samples["returns"]).square().mean()
+        losses = self._actor_losses(samples, images, old_std)
+        losses["critic"] = (self.critic(samples["privileged"]) - samples["returns"]).square().mean()
         return losses | self._estimator_losses(samples) if estimating else losses
 
     def _actor_losses(
-        self,
-        samples: Mapping[str, Tensor],
-        mirrored: int,
-        images: Mapping[str, Tensor] | None,
-        old_std: Tensor,
+        self, samples: Mapping[str, Tensor], images: Mapping[str, Tensor] | None, old_std: Tensor
     ) -> dict[str, Tensor]:
         config = self.config
-        with self.autocast():
-            mean, gate = self.actor.decide(*(samples[key] for key in POLICY_KEYS))
+        mean, gate = self.actor.decide(*(samples[key] for key in POLICY_KEYS))
         distribution = self.distribution(mean)
-        log_prob = distribution.log_prob(samples["action"]).sum(dim=1)
+        log_prob = distribution.log_prob(samples["action"])[:, self.acting].sum(dim=1)
         surrogate = clipped_surrogate(log_prob, samples["log_prob"], samples["advantage"], config.clip).mean()
-        entropy = distribution.entropy()[0].sum()
+        entropy = distribution.entropy()[0, self.acting].sum()
         figures = {"surrogate": surrogate, "entropy": entropy}
         loss = surrogate - config.entropy_weight * entropy
         if images is not None:
-            with self.autocast():
-                image, _ = self.actor.decide(*(images[key] for key in POLICY_KEYS))
+            image, _ = self.actor.decide(*(images[key] for key in POLICY_KEYS))
             difference = image - self.mirrors("action", mean[-len(image) :])
             deviations = difference / self.actor.log_std.exp().detach()
-            figures["asymmetry"] = 0.5 * deviations.square().sum(dim=1).mean()
+            figures["asymmetry"] = 0.5 * deviations[:, self.acting].square().sum(dim=1).mean()
             loss = loss + config.mirror_loss_weight * figures["asymmetry"]
         with torch.no_grad():
-            plain = slice(mirrored, None)
-            old = Normal(samples["mean"][plain], old_std, validate_args=False)
-            figures["kl"] = kl_divergence(old, self.distribution(mean[plain])).sum(dim=1).mean()
+            old = Normal(samples["mean"], old_std, validate_args=False)
+            figures["kl"] = kl_divergence(old, self.distribution(mean))[:, self.acting].sum(dim=1).mean()
             ratio = torch.exp(log_prob - samples["log_prob"])
             figures["clip_fraction"] = ((ratio - 1.0).abs() > config.clip).float().mean()
             figures["gate_entropy"] = torch.special.entr(gate).sum(dim=1).mean()
@@ -243,9 +197,8 @@ class Learner:
         return {"actor": loss, **figures}
 
     def _estimator_losses(self, samples: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        with self.autocast():
-            velocity, latent = self.actor.encode(samples["history"], samples["elevation_map"])
-            target = self.target_encoder(self.critic.normalizer(samples["next_privileged"]))
+        velocity, latent = self.actor.encode(samples["history"], samples["elevation_map"])
+        target = self.target_encoder(self.critic.normalised(samples["next_privileged"]))
         true_velocity = samples["privileged"][:, :VELOCITY_SIZE]
         prototypes = self.target_encoder.prototypes
         terms = estimation_loss(velocity, latent, true_velocity, target, prototypes, self.config.estimation)
@@ -278,14 +231,15 @@ class Learner:
         self.optimizers["actor"].param_groups[0]["lr"] = rate
         for name in groups:
             self.optimizers[name].step()
-        self.limit_noise(*self.config.std_bounds)
+        self.limit_noise()
         if "estimator" in groups:
             self.target_encoder.renormalise_prototypes()
         return {**result, "learning_rate": rate}
 
     @torch.no_grad()
-    def limit_noise(self, lowest: float, highest: float) -> None:
-        """Move the standard deviations of the exploration noise into these bounds [action units]."""
+    def limit_noise(self) -> None:
+        """Move the standard deviations of the exploration noise into their bounds."""
+        lowest, highest = self.std_bounds
         self.actor.log_std.clamp_(math.log(lowest), math.log(highest))
 
     def state_dict(self) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from lowlevel.rotations import (
 )
 from lowlevel.simulation import RobotState
 from lowlevel.terrain import Terrain
-from robots.g1.constants import ARM_JOINTS
+from robots.g1.constants import ARM_JOINTS, BODY_POINTS
 
 LOADED_FOOT_FORCE = 5.0
 """A foot with more contact force than this is on the ground [N]."""
@@ -48,6 +48,8 @@ class Measurement:
     """Sole above the ground below it (N, 2) [m]."""
     foot_contact: Tensor
     """Loaded feet (N, 2), boolean."""
+    body_clearance: Tensor
+    """Centres of the robot's body points above the ground below them (N, 7) [m]."""
 
 
 def measure(robot: RobotState, terrain: Terrain) -> Measurement:
@@ -67,6 +69,7 @@ def measure(robot: RobotState, terrain: Terrain) -> Measurement:
         torso_orientation=multiply(about_axis(2, -heading), robot.torso_quaternion),
         foot_clearance=robot.foot_position[..., 2] - ground,
         foot_contact=robot.foot_force.norm(dim=-1) > LOADED_FOOT_FORCE,
+        body_clearance=robot.body_points[..., 2] - terrain.height(robot.body_points[..., :2]),
     )
 
 
@@ -116,22 +119,32 @@ TRACKING_FIGURES: dict[str, tuple[str, Callable[[Measurement, Tensor], Tensor]]]
 """The paper's figures: name -> (unit, function of measurement and clamped command giving (N,))."""
 
 
-FALLEN_TILT = 0.9
-"""Angle between the torso's axis and where its reference has it, beyond which a robot counts as fallen [rad]."""
-FALLEN_DROP = 0.25
+def has_fallen(measured: Measurement) -> Tensor:
+    """Whether pelvis, torso, head, a knee or an elbow reaches the ground under it (N,).
+
+    A fall is what a robot does, whatever it was told, whoever controls it, and on any terrain.
+    """
+    radius = torch.tensor([point.radius for point in BODY_POINTS], device=measured.heading.device)
+    return (measured.body_clearance < radius).any(dim=1)
+
+
+LOST_TILT = 0.9
+"""Angle between the torso's axis and where its reference has it, beyond which training gives a robot up [rad]."""
+LOST_DROP = 0.25
 """Distance of the pelvis below its reference height beyond which it does [m]."""
-FALLEN_HEIGHT = 0.18
+LOST_HEIGHT = 0.18
 """Base height below which it always does [m]."""
 
 
-def has_fallen(measured: Measurement, reference: Tensor) -> Tensor:
+def is_lost(measured: Measurement, reference: Tensor) -> Tensor:
     """Whether a robot is beyond saving (N,): torso far off its reference attitude, or pelvis far too low.
 
-    ``reference`` (N, 21) is the slewed command, so that a step of the command is not mistaken for a fall.
+    Training need not wait for the fall. ``reference`` (N, 21) is the slewed command, so that a step of the command is
+    not mistaken for the beginning of a fall.
     """
     wanted = from_roll_pitch_yaw(reference[:, TORSO])
     _, x, y, _ = multiply(conjugate(wanted), measured.torso_orientation).unbind(-1)
     # The cosine of the angle between the two vertical axes.
     tilt = torch.acos((1.0 - 2.0 * (x * x + y * y)).clamp(-1.0, 1.0))
-    too_low = measured.base_height < (reference[:, HEIGHT] - FALLEN_DROP).clamp_min(FALLEN_HEIGHT)
-    return (tilt > FALLEN_TILT) | too_low
+    too_low = measured.base_height < (reference[:, HEIGHT] - LOST_DROP).clamp_min(LOST_HEIGHT)
+    return (tilt > LOST_TILT) | too_low

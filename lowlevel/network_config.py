@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from torch import nn
 
+from robots.errors import PilotError
+
 MAP_SIDE = 11
 """Cells along each side of the elevation map."""
 
@@ -36,7 +38,7 @@ class NetworkConfig:
     """Sizes of the networks, and the switches of the paper's ablations."""
 
     vision: bool = True
-    """False: ablation "w/o vision"; the map is masked to zero and its encoding is a zero vector."""
+    """False: ablation "w/o vision"; neither the map nor its encoding is an input of any network."""
     attention: bool = True
     """False: ablation "w/o attention-based encoder"; an MLP on the map gives the whole encoding."""
     mixture: bool = True
@@ -80,11 +82,11 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         if self.attention_width % self.attention_heads:
-            raise ValueError(
+            raise PilotError(
                 f"attention_width {self.attention_width} is not a multiple of {self.attention_heads} heads"
             )
         if any(window % 2 == 0 or window > MAP_SIDE for window in self.pooling_windows):
-            raise ValueError(f"pooling windows must be odd and at most {MAP_SIDE}, not {self.pooling_windows}")
+            raise PilotError(f"pooling windows must be odd and at most {MAP_SIDE}, not {self.pooling_windows}")
 
 
 def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:

@@ -41,11 +41,6 @@ def small_output_(weight: Tensor, bias: Tensor, gain: float) -> None:
     nn.init.zeros_(bias)
 
 
-def without_autocast(values: Tensor) -> torch.autocast:
-    """A context for output layers, which compute in full precision even under autocast."""
-    return torch.autocast(values.device.type, enabled=False)
-
-
 class HistoryEncoder(nn.Module):
     """History and map to base velocity and next-state latent.
 
@@ -55,11 +50,14 @@ class HistoryEncoder(nn.Module):
     def __init__(self, sizes: ObservationSizes, config: NetworkConfig) -> None:
         super().__init__()
         outputs = VELOCITY_SIZE + config.latent
-        self.layers = perceptron(sizes.history + sizes.elevation_map, config.history_hidden, outputs)
+        self.vision = config.vision
+        inputs = sizes.history + (sizes.elevation_map if config.vision else 0)
+        self.layers = perceptron(inputs, config.history_hidden, outputs)
 
     def forward(self, history: Tensor, elevation_map: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised history (N, H) and map (N, M) to velocity (N, 3) [m/s] and unit latent (N, latent)."""
-        outputs = self.layers(torch.cat([history, elevation_map], dim=1)).float()
+        inputs = torch.cat([history, elevation_map], dim=1) if self.vision else history
+        outputs = self.layers(inputs)
         return outputs[:, :VELOCITY_SIZE], functional.normalize(outputs[:, VELOCITY_SIZE:], dim=1)
 
 
@@ -92,12 +90,16 @@ class MixtureOfExperts(nn.Module):
         """Each expert's action (E, N, outputs) for ``inputs`` (N, inputs)."""
         hidden = functional.elu(self.first(inputs)).unflatten(1, (self.experts, -1)).transpose(0, 1)
         hidden = functional.elu(torch.baddbmm(self.second_bias, hidden, self.second_weight))
-        with without_autocast(hidden):
-            return torch.baddbmm(self.output_bias, hidden.float(), self.output_weight)
+        return torch.baddbmm(self.output_bias, hidden, self.output_weight)
+
+    @torch.no_grad()
+    def silence(self, outputs: slice) -> None:
+        """Make these outputs zero for good."""
+        self.output_weight[..., outputs], self.output_bias[..., outputs] = 0.0, 0.0
 
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """``inputs`` (N, inputs) to the blended action (N, outputs) and gate probabilities (N, E)."""
-        gate = torch.softmax(self.gate_layers(inputs).float(), dim=1)
+        gate = torch.softmax(self.gate_layers(inputs), dim=1)
         return (gate.T.unsqueeze(-1) * self.proposals(inputs)).sum(dim=0), gate
 
 
@@ -110,11 +112,15 @@ class MonolithicActor(nn.Module):
         self.output = nn.Linear(config.monolithic_hidden[-1], outputs)
         small_output_(self.output.weight, self.output.bias, config.output_gain)
 
+    @torch.no_grad()
+    def silence(self, outputs: slice) -> None:
+        """Make these outputs zero for good."""
+        self.output.weight[outputs], self.output.bias[outputs] = 0.0, 0.0
+
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """``inputs`` (N, inputs) to the action (N, outputs) and a gate of ones (N, 1)."""
-        hidden = self.hidden(inputs).float()
-        with without_autocast(hidden):
-            return self.output(hidden), torch.ones_like(hidden[:, :1])
+        hidden = self.hidden(inputs)
+        return self.output(hidden), torch.ones_like(hidden[:, :1])
 
 
 class PilotActor(nn.Module):
@@ -140,10 +146,10 @@ class PilotActor(nn.Module):
         self.history_encoder = HistoryEncoder(sizes, config)
         encoder = MapEncoder if config.attention else PlainMapEncoder
         self.map_encoder: nn.Module = encoder(sizes, config).requires_grad_(config.vision)
-        self.perception_size = config.map_global + config.attention_width
+        self.perception_size = config.map_global + config.attention_width if config.vision else 0
         inputs = self.perception_size + config.latent + VELOCITY_SIZE + sizes.frame + 1
         head = MixtureOfExperts if config.mixture else MonolithicActor
-        self.head: nn.Module = head(inputs, sizes.action, config)
+        self.head: MixtureOfExperts | MonolithicActor = head(inputs, sizes.action, config)
         self.log_std = nn.Parameter(torch.full((sizes.action,), math.log(initial_std)))
 
     def estimator_parameters(self) -> list[nn.Parameter]:
@@ -155,6 +161,10 @@ class PilotActor(nn.Module):
         estimator = {id(parameter) for parameter in self.estimator_parameters()}
         return [p for p in self.parameters() if p.requires_grad and id(p) not in estimator]
 
+    def silence(self, actions: slice) -> None:
+        """Leave these actions at zero for good: for actions that were never trained."""
+        self.head.silence(actions)
+
     def encode(self, history: Tensor, elevation_map: Tensor) -> tuple[Tensor, Tensor]:
         """Raw history (N, H) and map (N, M) [m] to velocity (N, 3) [m/s] and unit latent (N, latent)."""
         frames = self.normalizer(history.unflatten(1, (-1, self.sizes.frame)))
@@ -165,11 +175,10 @@ class PilotActor(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Raw current frame (N, F), elevation map (N, M) [m], flag (N, 1) and estimates to mean and gate."""
         current = self.normalizer(frame)
+        inputs = [latent.detach(), velocity.detach(), current, flag]
         if self.config.vision:
-            perception = self.map_encoder(self._heights(elevation_map), current)
-        else:
-            perception = current.new_zeros(current.shape[0], self.perception_size)
-        return self.head(torch.cat([perception, latent.detach(), velocity.detach(), current, flag], dim=1))
+            inputs.insert(0, self.map_encoder(self._heights(elevation_map), current))
+        return self.head(torch.cat(inputs, dim=1))
 
     def forward(self, history: Tensor, elevation_map: Tensor, flag: Tensor) -> ActorOutput:
         """Raw history (N, H), elevation map (N, M) [m] and tracking flag (N, 1) to the policy's outputs."""
@@ -178,9 +187,12 @@ class PilotActor(nn.Module):
         return ActorOutput(mean, gate, velocity, latent)
 
     def _heights(self, elevation_map: Tensor) -> Tensor:
-        if not self.config.vision:
-            return torch.zeros_like(elevation_map)
         return (elevation_map - self.config.map_offset) * self.config.map_scale
+
+
+def seen_by_critic(sizes: ObservationSizes, config: NetworkConfig) -> int:
+    """Columns of the privileged observation that the critic sees: the map at its end only where the policy has one."""
+    return sizes.privileged if config.vision else sizes.privileged - sizes.elevation_map
 
 
 class Critic(nn.Module):
@@ -189,15 +201,19 @@ class Critic(nn.Module):
     def __init__(self, sizes: ObservationSizes, config: NetworkConfig, command_columns: Tensor | None = None) -> None:
         """``command_columns`` (P,) bool: privileged columns that already have a fixed scale; default none."""
         super().__init__()
-        self.normalizer = RunningNormalizer(sizes.privileged, command_columns)
-        self.hidden = perceptron(sizes.privileged, config.critic_hidden, 1)[:-1]
+        self.seen = seen_by_critic(sizes, config)
+        columns = None if command_columns is None else command_columns[: self.seen]
+        self.normalizer = RunningNormalizer(self.seen, columns)
+        self.hidden = perceptron(self.seen, config.critic_hidden, 1)[:-1]
         self.output = nn.Linear(config.critic_hidden[-1], 1)
 
     def forward(self, privileged: Tensor) -> Tensor:
         """Raw privileged observation (N, P) to values (N,)."""
-        hidden = self.hidden(self.normalizer(privileged)).float()
-        with without_autocast(hidden):
-            return self.output(hidden).squeeze(1)
+        return self.output(self.hidden(self.normalised(privileged))).squeeze(1)
+
+    def normalised(self, privileged: Tensor) -> Tensor:
+        """The columns that the critic sees, normalised (N, seen)."""
+        return self.normalizer(privileged[:, : self.seen])
 
 
 class TargetEncoder(nn.Module):
@@ -214,15 +230,16 @@ class TargetEncoder(nn.Module):
     def __init__(self, sizes: ObservationSizes, config: NetworkConfig, command_columns: Tensor | None = None) -> None:
         """``command_columns`` (P,) bool: privileged columns to hide; default none."""
         super().__init__()
-        hidden = torch.zeros(sizes.privileged) if command_columns is None else command_columns.detach().cpu()
+        seen = seen_by_critic(sizes, config)
+        hidden = torch.zeros(seen) if command_columns is None else command_columns[:seen].detach().cpu()
         prototypes = torch.randn(config.prototypes, config.latent)
-        self.layers = perceptron(sizes.privileged, config.target_hidden, config.latent)
+        self.layers = perceptron(seen, config.target_hidden, config.latent)
         self.prototypes = nn.Parameter(functional.normalize(prototypes, dim=1))
         self.register_buffer("visible", 1.0 - hidden.float())
 
     def forward(self, normalised_privileged: Tensor) -> Tensor:
-        """Normalised next privileged observation (N, P) to a unit latent (N, latent)."""
-        return functional.normalize(self.layers(normalised_privileged * self.visible).float(), dim=1)
+        """Normalised next privileged observation (N, seen) to a unit latent (N, latent)."""
+        return functional.normalize(self.layers(normalised_privileged * self.visible), dim=1)
 
     @torch.no_grad()
     def renormalise_prototypes(self) -> None:

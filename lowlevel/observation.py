@@ -1,11 +1,12 @@
 """Observation layout: what the policy and the critic see, stated once as tables of named blocks.
 
-The policy's frame is the paper's o_t^n = [q, q_dot, omega, g, c, a_{t-1}] plus two additions: the slewed posture
-reference and the gait clock, without which the nominal motion under the residual would be hidden from the policy.
+The policy's frame is the paper's o_t^n = [q, q_dot, omega, g, c, a_{t-1}] plus two additions: the slewed velocity and
+posture, and the gait clock, without which the joint targets under the residual would be hidden from the policy.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 
@@ -14,8 +15,7 @@ from torch import Tensor
 
 from lowlevel import commands
 from lowlevel.commands import COMMAND_SIZE, CommandSpace
-from lowlevel.nominal import NominalMotion
-from lowlevel.nominal_state import NominalState
+from lowlevel.reference import Reference, ReferenceState
 from lowlevel.terrain import MAP_MIRROR, MAP_SIZE
 from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS
 from robots.g1.mirror import AXIAL_VECTOR, JOINTS_MIRROR, VECTOR, Mirror, concatenate, signs
@@ -27,6 +27,9 @@ NOMINAL_MAP_DISTANCE = 0.75
 
 _PAIR_VECTOR = Mirror(concatenate(VECTOR, VECTOR).index[[3, 4, 5, 0, 1, 2]], concatenate(VECTOR, VECTOR).sign)
 _PAIR = Mirror(signs(1, 1).index[::-1].copy(), signs(1, 1).sign)
+_SLEWED = slice(0, commands.ARMS.start)
+"""Velocity and posture: what of the slewed command the policy sees beside the command."""
+_SLEWED_MIRROR = Mirror(commands.MIRROR.index[_SLEWED], commands.MIRROR.sign[_SLEWED])
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ FRAME: tuple[Block, ...] = (
     Block("projected_gravity", VECTOR),
     Block("command", commands.MIRROR, normalised=False),
     Block("last_action", JOINTS_MIRROR),
-    Block("posture_reference", signs(1, -1, 1, -1), normalised=False),
+    Block("slewed_command", _SLEWED_MIRROR, normalised=False),
     # Half a gait period later left and right have changed places, so both components change sign.
     Block("gait_clock", signs(-1, -1), normalised=False),
 )
@@ -128,8 +131,8 @@ class NoiseConfig:
 class FrameBuilder:
     """Assembles proprioceptive frames; shared by the environment and the frozen controller."""
 
-    def __init__(self, space: CommandSpace, motion: NominalMotion, device: torch.device | str = "cpu") -> None:
-        self.motion = motion
+    def __init__(self, space: CommandSpace, reference: Reference, device: torch.device | str = "cpu") -> None:
+        self._reference = reference
         lower, upper = space.bounds(device)
         self._middle, self._half_range = 0.5 * (upper + lower), 0.5 * (upper - lower)
         self._default = torch.tensor(DEFAULT_POSITION, dtype=torch.float32, device=device)
@@ -142,10 +145,10 @@ class FrameBuilder:
         projected_gravity: Tensor,
         command: Tensor,
         last_action: Tensor,
-        nominal: NominalState,
+        reference: ReferenceState,
     ) -> Tensor:
-        """Frame (N, FRAME_SIZE) from measurements, the tracked command and the nominal motion's state."""
-        reference = (nominal.reference - self._middle) / self._half_range
+        """Frame (N, FRAME_SIZE) from measurements, the clamped command (N, 21) and the reference."""
+        slewed = (reference.command - self._middle) / self._half_range
         parts = (
             joint_position - self._default,
             joint_velocity,
@@ -153,10 +156,20 @@ class FrameBuilder:
             projected_gravity,
             (command - self._middle) / self._half_range,
             last_action,
-            reference[:, commands.POSTURE],
-            self.motion.clock(nominal),
+            slewed[:, _SLEWED],
+            self._reference.clock(reference),
         )
         return torch.cat(parts, dim=-1)
+
+
+def columns(blocks: Sequence[Block], name: str) -> slice:
+    """Where the block called ``name`` stands among ``blocks``."""
+    start = 0
+    for block in blocks:
+        if block.name == name:
+            return slice(start, start + block.size)
+        start += block.size
+    raise LookupError(f"there is no block {name!r}")
 
 
 def split_frame(frame: Tensor) -> dict[str, Tensor]:
@@ -180,5 +193,5 @@ def map_observation(elevation: Tensor) -> Tensor:
     return (elevation - NOMINAL_MAP_DISTANCE).clamp(-1.0, 1.0)
 
 
-assert FRAME_SIZE == 3 * NUM_JOINTS + 6 + COMMAND_SIZE + 6
+assert FRAME_SIZE == 3 * NUM_JOINTS + 6 + COMMAND_SIZE + 9
 assert MAP_MIRROR.index.size == MAP_SIZE

@@ -8,7 +8,7 @@ actor's own change and not the estimator's. All statistics are taken over all ra
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -21,6 +21,7 @@ from lowlevel.learner import ACTOR_KEYS, POLICY_KEYS, Learner, PPOConfig
 from lowlevel.networks import VELOCITY_SIZE, NetworkConfig, ObservationSizes
 from lowlevel.rollout import RolloutStorage, generalized_advantages
 from lowlevel.symmetry import TensorMirrors
+from robots.errors import PilotError
 from robots.g1.mirror import Mirror
 
 __all__ = ["PPO", "NonFiniteError", "PPOConfig"]
@@ -56,7 +57,7 @@ class PPO:
         from the next-state encoder. Ranks draw different exploration noise from the same ``seed``.
 
         Raises:
-            ValueError: if sizes do not fit together.
+            PilotError: if sizes do not fit together.
         """
         self.config = config
         self.sizes = sizes
@@ -77,9 +78,6 @@ class PPO:
         self.actor = self.learner.actor
         self.critic = self.learner.critic
         self.generator = torch.Generator(self.device).manual_seed(seed + 1000 * rank())
-        self._noise: Tensor | None = None
-        self.estimated_velocity = torch.zeros(num_envs, VELOCITY_SIZE, device=self.device)
-        """Base velocity (N, 3) [m/s] in the heading frame, as the last action's observation tells."""
         widths = {"history": sizes.history, "elevation_map": sizes.elevation_map, "flag": 1}
         widths |= {"privileged": sizes.privileged, "next_privileged": sizes.privileged}
         widths |= {"action": sizes.action, "mean": sizes.action}
@@ -89,12 +87,12 @@ class PPO:
         self._shapes = shapes
         self.storage = self._room_for(config.steps_per_update, num_envs)
         if self.storage.size % config.minibatches:
-            raise ValueError(
+            raise PilotError(
                 f"{self.storage.size} samples per update do not split into {config.minibatches} minibatches"
             )
 
     def _room_for(self, steps: int, num_envs: int) -> RolloutStorage:
-        return RolloutStorage(steps, num_envs, self._shapes, self.device, self.config.symmetry == "augmentation")
+        return RolloutStorage(steps, num_envs, self._shapes, self.device)
 
     @property
     def _minibatch(self) -> int:
@@ -115,7 +113,8 @@ class PPO:
         """
         observation = {key: observation[key].to(self.device) for key in OBSERVATION_KEYS}
         output = self.learner.policy(observation)
-        action = output.mean + self.actor.log_std.exp() * self._draw_noise(output.mean)
+        noise = torch.randn(output.mean.shape, generator=self.generator, device=self.device)
+        action = output.mean + self.actor.log_std.exp() * noise
         if not bool(torch.isfinite(action).all()):
             for key, values in observation.items():
                 require_finite(f"observation {key!r} at rollout step {self.storage.position}", values)
@@ -127,42 +126,29 @@ class PPO:
             "log_prob": self.learner.log_prob(output.mean, action),
         }
         self.storage.write({**observation, **estimates, **acted})
-        self.estimated_velocity = output.velocity
         return action
 
-    def _draw_noise(self, like: Tensor) -> Tensor:
-        """Standard normal noise of the shape of ``like``, correlated with that of the step before."""
-        fresh = torch.randn(like.shape, generator=self.generator, device=self.device)
-        kept = self.config.noise_correlation
-        self._noise = fresh if self._noise is None else kept * self._noise + math.sqrt(1.0 - kept * kept) * fresh
-        return self._noise
+    def enter(self, std: tuple[float, float], acting: int, rollout_doublings: int) -> None:
+        """Go on with exploration noise between the bounds ``std``, in the first ``acting`` actions only.
 
-    def calm(self, share: float) -> None:
-        """Lower the exploration noise to what it may be after ``share`` of the run, in [0, 1]."""
-        config, lowest = self.config, self.config.std_bounds[0]
-        highest = config.initial_std * (config.final_std / config.initial_std) ** share
-        self.learner.limit_noise(lowest, max(lowest, highest))
-
-    def lengthen(self, share: float) -> None:
-        """Make the next rollout as long as it is to be after ``share`` of the run, in [0, 1].
+        Rollouts are 2 to the power of ``rollout_doublings`` times as long as at first.
 
         Raises:
             ValueError: in the middle of a rollout.
         """
-        config = self.config
-        doublings = min(int(share * (config.rollout_doublings + 1)), config.rollout_doublings)
-        steps = config.steps_per_update * 2**doublings
+        steps = self.config.steps_per_update * 2**rollout_doublings
         if self.storage.position > 0:
             raise ValueError(f"step {self.storage.position} of a rollout of {self.storage.steps} is recorded already")
         if steps != self.storage.steps:
             self.storage = self._room_for(steps, self.storage.num_envs)
+        self.learner.acting = slice(0, acting)
+        self.learner.std_bounds = std
+        self.learner.limit_noise()
 
     @torch.no_grad()
     def deterministic(self, observation: Mapping[str, Tensor]) -> Tensor:
-        """Mean actions (N, A), without noise; nothing is stored but :attr:`estimated_velocity`."""
-        output = self.learner.policy({key: observation[key].to(self.device) for key in ACTOR_KEYS})
-        self.estimated_velocity = output.velocity
-        return output.mean
+        """Mean actions (N, A), without noise; nothing is stored."""
+        return self.learner.policy({key: observation[key].to(self.device) for key in ACTOR_KEYS}).mean
 
     def record(self, reward: Tensor, terminated: Tensor, truncated: Tensor, next_privileged: Tensor) -> None:
         """Store what followed the last :meth:`act`.
@@ -187,7 +173,7 @@ class PPO:
 
         Raises:
             NonFiniteError: if a loss or a gradient is not finite; the step in question is not taken.
-            ValueError: if the rollout is not full.
+            PilotError: if the rollout is not full.
         """
         storage, config = self.storage, self.config
         if not storage.full:
@@ -196,23 +182,20 @@ class PPO:
         if calibrating:
             self._calibrate()
         explained = self._store_returns(observation_after["privileged"].to(self.device))
-        if config.symmetry == "augmentation":
-            self._store_mirror_images()
         old_std = self.actor.log_std.detach().exp().clone()
         history: dict[str, list[float]] = {}
         minibatches = self._draw_minibatches()
         # All of them now, because the first step changes the estimator.
         images = [self._images(index) for index in minibatches]
         for step, index in enumerate(minibatches):
-            estimating = step < config.estimator_epochs * config.minibatches
-            samples, mirrored = self._samples(index, estimating)
-            losses = self.learner.losses(samples, mirrored, images[step], old_std, estimating)
+            estimating = step < config.minibatches  # a supervised learner needs but one pass
+            losses = self.learner.losses(self._samples(index, estimating), images[step], old_std, estimating)
             for name, number in self.learner.step(losses).items():
                 history.setdefault(name, []).append(number)
         means = {name: sum(numbers) / len(numbers) for name, numbers in history.items()}
         means["estimation/velocity_rmse"] = math.sqrt(means.pop("estimation/velocity_mse"))
         means["estimation/policy_drift"] = self._estimator_drift()
-        means |= {"explained_variance": explained, "std": float(old_std.mean())}
+        means |= {"explained_variance": explained, "std": float(old_std[self.learner.acting].mean())}
         if not calibrating:
             self._update_normalizers()
         storage.clear()
@@ -221,8 +204,7 @@ class PPO:
 
     @torch.no_grad()
     def _values(self, privileged: Tensor) -> Tensor:
-        with self.learner.autocast():
-            return self.critic(privileged)
+        return self.critic(privileged)
 
     @torch.no_grad()
     def _store_returns(self, privileged_after: Tensor) -> float:
@@ -252,33 +234,16 @@ class PPO:
 
     def _update_normalizers(self) -> None:
         self.actor.normalizer.update(self.storage.flat("history")[:, -self.sizes.frame :])
-        self.critic.normalizer.update(self.storage.flat("privileged"))
+        self.critic.normalizer.update(self.storage.flat("privileged")[:, : self.critic.seen])
 
+    @torch.no_grad()
     def _calibrate(self) -> None:
         """Fit the normalisers to the very first rollout before anything is learned from unscaled numbers.
 
         The untrained policy is almost constant, so its action means hardly change; they are computed again.
         """
         self._update_normalizers()
-        self._recompute_policy(self.storage.flat)
-
-    @torch.no_grad()
-    def _store_mirror_images(self) -> None:
-        """Add the mirror image of every sample, with its log-probability under the policy that acted.
-
-        With the log-probability of the original instead, the first ratio of a mirrored sample would not be
-        one, and an asymmetric policy would diverge. With the one used here, mirrored samples move an action
-        and its mirror image alike and leave their difference as it is: that is what the symmetry loss is for.
-        """
-        for key in (*OBSERVATION_KEYS, "next_privileged", "action"):
-            self.storage.images(key).copy_(self.mirrors(key, self.storage.flat(key)))
-        for key in ("advantage", "returns"):
-            self.storage.images(key).copy_(self.storage.flat(key))
-        self._recompute_policy(self.storage.images)
-
-    @torch.no_grad()
-    def _recompute_policy(self, rows: Callable[[str], Tensor]) -> None:
-        """Fill in estimates, means and log-probabilities of the rows that ``rows`` views, in minibatches."""
+        rows = self.storage.flat
         for start in range(0, self.storage.size, self._minibatch):
             part = slice(start, start + self._minibatch)
             output = self.learner.policy({key: rows(key)[part] for key in ACTOR_KEYS})
@@ -295,62 +260,52 @@ class PPO:
 
         return [index for _ in range(self.config.epochs) for index in torch.split(shuffled(), self._minibatch)]
 
-    def _samples(self, index: Tensor, estimating: bool) -> tuple[dict[str, Tensor], int]:
-        """The samples at ``index``; the first so many of them, second result, are their mirror images."""
-        mirrored = 0
-        if self.config.symmetry == "augmentation":
-            mirrored = len(index) // 2
-            index = torch.cat([index[:mirrored] + self.storage.size, index[mirrored:]])
+    def _samples(self, index: Tensor, estimating: bool) -> dict[str, Tensor]:
+        """The samples at ``index``, with what the estimator learns from if ``estimating``."""
         names = [*POLICY_KEYS, "privileged", "action", "mean", "log_prob", "advantage", "returns"]
         if estimating:
             names += ["history", "next_privileged"]
-        return {name: self._rows(name).index_select(0, index) for name in names}, mirrored
+        return {name: self._rows(name).index_select(0, index) for name in names}
 
     @torch.no_grad()
     def _images(self, index: Tensor) -> dict[str, Tensor] | None:
-        """Mirror images of the last samples at ``index``, which :meth:`_samples` never mirrors, for the policy."""
-        if self.config.symmetry == "none":
+        """Mirror images of the last samples at ``index``, for the policy."""
+        if self.config.mirror_loss_weight == 0.0:
             return None
         share = max(1, int(self.config.mirror_loss_share * len(index)))
         rows = {key: self.storage.flat(key).index_select(0, index[-share:]) for key in ACTOR_KEYS}
         image = {key: self.mirrors(key, values) for key, values in rows.items()}
-        with self.learner.autocast():
-            velocity, latent = self.actor.encode(image["history"], image["elevation_map"])
+        velocity, latent = self.actor.encode(image["history"], image["elevation_map"])
         frame = image.pop("history")[:, -self.sizes.frame :].clone()
         return {**image, "frame": frame, "velocity": velocity, "latent": latent}
 
     def _rows(self, name: str) -> Tensor:
         if name == "frame":
-            return self.storage.samples("history")[:, -self.sizes.frame :]
-        return self.storage.samples(name)
+            return self.storage.flat("history")[:, -self.sizes.frame :]
+        return self.storage.flat(name)
 
     @torch.no_grad()
     def _estimator_drift(self) -> float:
         """KL divergence of the policy [nat] that the estimator's own learning caused, on the last control step."""
         recorded = {key: self.storage.data[key][-1] for key in (*ACTOR_KEYS, *POLICY_KEYS[3:])}
         recorded["frame"] = recorded["history"][:, -self.sizes.frame :]
-        with self.learner.autocast():
-            before, _ = self.actor.decide(*(recorded[key] for key in POLICY_KEYS))
+        before, _ = self.actor.decide(*(recorded[key] for key in POLICY_KEYS))
         after = self.learner.policy(recorded).mean
         divergence = kl_divergence(self.learner.distribution(before), self.learner.distribution(after))
-        return float(divergence.sum(dim=1).mean())
+        return float(divergence[:, self.learner.acting].sum(dim=1).mean())
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that learning depends on, as tensors, numbers, strings, lists and dicts."""
-        generator = self.generator.get_state()
-        return {**self.learner.state_dict(), "generator": generator, "noise": self._noise, "updates": self.updates}
+        return {**self.learner.state_dict(), "generator": self.generator.get_state(), "updates": self.updates}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a :meth:`state_dict`, dropping a half-filled rollout and the noise of another number of robots.
+        """Restore a :meth:`state_dict`, dropping a half-filled rollout.
 
         A single process continues bit for bit. With several ranks the state is rank 0's: it continues its own
         noise, and the others draw a fresh sequence.
         """
         self.learner.load_state_dict(state)
         self.updates = int(state["updates"])
-        self._noise = state.get("noise")
-        if (self._noise is not None and len(self._noise) != self.storage.num_envs) or rank() > 0:
-            self._noise = None
         if rank() == 0:
             self.generator.set_state(state["generator"].cpu())
         else:

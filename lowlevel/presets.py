@@ -4,44 +4,172 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lowlevel.environment import EnvironmentConfig
 from lowlevel.networks import NetworkConfig
-from lowlevel.nominal_config import NominalConfig
-from lowlevel.rewards import PAPER_WEIGHTS
+from lowlevel.randomization import RandomizationConfig
+from lowlevel.rewards import RewardWeights
+from lowlevel.stages import Stage
 from lowlevel.terrain import TerrainConfig
 from lowlevel.trainer import TrainingConfig
 
-FLAT = TrainingConfig(network=NetworkConfig())
+TRACKING = RewardWeights(
+    linear_velocity=6.0,
+    linear_velocity_fine=4.0,
+    angular_velocity=4.0,
+    angular_velocity_fine=2.0,
+    velocity_progress=4.0,
+    base_height=3.0,
+    torso_orientation=8.0,
+    upper_body_position=1.5,
+    alive=1.0,
+    vertical_velocity=-0.5,
+    base_motion=-0.05,
+    feet_close=-10.0,
+    stand_still=-1.0,
+    torque_limits=-0.1,
+)
+"""Tracking counts for more than in the paper, and with it what is added to it."""
+
+SHAPED = replace(
+    TRACKING, foot_phase=3.0, foot_placement=5.0, contact_schedule=2.0, swing_height=3.0, linear_velocity_fine=3.0
+)
+"""While the robot learns what a step is."""
+
+STEPPING = replace(TRACKING, foot_phase=2.0, foot_placement=2.0, contact_schedule=1.0, swing_height=2.0)
+"""While it improves its steps: shaping that has done its work makes a fall cost more, and speed cost falls."""
+
+GENTLE = RandomizationConfig(
+    friction=(0.6, 1.2), hand_load_probability=0.0, push_velocity=0.15, delay=(0.7, 0.3, 0.0), waist_effort=(50.0, 50.0)
+)
+"""For a robot that still learns to walk."""
+
+EVERYTHING = (
+    ("steer", 0.15),
+    ("slow", 0.15),
+    ("stand", 0.1),
+    ("stand_and_work", 0.3),
+    ("walk_and_work", 0.3),
+)
+"""Unlike the evaluation it also stands in the neutral posture, what a planner starts from and stops in, and walks
+slowly."""
+
+SLABS = TerrainConfig(tiles=("flat", "irregular"), tile_size=8.0)
+"""The simple terrain of the paper: flat, and irregular by 2 cm."""
+
+STAGES = (
+    Stage(
+        "balance",
+        waits_for="episode/steps_between_falls",
+        above=150.0,
+        most_steps=4_000_000,
+        std=(0.4, 1.0),
+        gait_prior=1.0,
+        mixture=(("forward", 0.3), ("steer", 0.3), ("stand", 0.2), ("squat", 0.2)),
+        rewards=SHAPED,
+        randomization=GENTLE,
+    ),
+    Stage(
+        "walk",
+        waits_for="curriculum/opening/forward",
+        above=0.95,
+        most_steps=6_000_000,
+        std=(0.05, 0.3),
+        gait_prior=1.0,
+        mixture=(("forward", 0.5), ("steer", 0.3), ("stand", 0.1), ("squat", 0.1)),
+        rewards=SHAPED,
+        randomization=GENTLE,
+    ),
+    Stage(
+        "stride",
+        waits_for="curriculum/quality/forward",
+        above=0.62,
+        most_steps=5_000_000,
+        std=(0.05, 0.18),
+        mixture=(("forward", 0.6), ("steer", 0.15), ("stand", 0.25)),
+        rewards=STEPPING,
+        randomization=GENTLE,
+    ),
+    Stage(
+        "steer",
+        waits_for="curriculum/quality/steer",
+        above=0.62,
+        most_steps=8_000_000,
+        std=(0.05, 0.18),
+        mixture=(("forward", 0.25), ("steer", 0.45), ("slow", 0.1), ("stand", 0.2)),
+        rewards=STEPPING,
+        randomization=GENTLE,
+    ),
+    Stage(
+        "squat",
+        waits_for="curriculum/quality/squat",
+        above=0.72,
+        most_steps=8_000_000,
+        std=(0.05, 0.18),
+        mixture=(("steer", 0.4), ("slow", 0.1), ("stand", 0.1), ("squat", 0.4)),
+        rewards=STEPPING,
+        randomization=GENTLE,
+    ),
+    Stage(
+        "bend and reach",
+        waits_for="curriculum/opening/stand_and_work",
+        above=0.98,
+        most_steps=15_000_000,
+        std=(0.05, 0.15),
+        mixture=(("steer", 0.3), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.5)),
+        rewards=STEPPING,
+        randomization=GENTLE,
+    ),
+    Stage(
+        "walk and work",
+        waits_for="curriculum/opening/walk_and_work",
+        above=0.98,
+        most_steps=20_000_000,
+        std=(0.05, 0.15),
+        rollout_doublings=1,
+        mixture=(("steer", 0.2), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.2), ("walk_and_work", 0.4)),
+        rewards=STEPPING,
+        randomization=GENTLE,
+    ),
+    Stage(
+        "harden",
+        most_steps=60_000_000,
+        std=(0.05, 0.13),
+        rollout_doublings=2,
+        mixture=EVERYTHING,
+        terrain=SLABS,
+        rewards=STEPPING,
+    ),
+    Stage(
+        "refine",
+        std=(0.05, 0.10),
+        rollout_doublings=2,
+        arms_act=True,
+        mixture=EVERYTHING,
+        terrain=SLABS,
+        rewards=TRACKING,
+    ),
+)
+"""From nothing to the controller: balance with a gait prior, walk with it, absorb it, then open one kind of command
+after the other, then everything with rougher ground and disturbances, at last with less noise and without shaping."""
 
 
-def _environment(**changes: object) -> EnvironmentConfig:
-    return replace(FLAT.environment, **changes)  # type: ignore[arg-type]
+def _paper_weights(stage: Stage) -> Stage:
+    """``stage`` with the paper's rewards alone, once there is a gait."""
+    return stage if stage.gait_prior > 0.0 else replace(stage, rewards=RewardWeights())
 
 
-SLABS = replace(FLAT, environment=_environment(terrain=TerrainConfig(tiles=("flat", "irregular"), tile_size=16.0)))
+SIMPLE = TrainingConfig(stages=STAGES, network=NetworkConfig(vision=False))
+FULL_NETWORK = replace(SIMPLE, network=NetworkConfig())
 
 PRESETS: dict[str, TrainingConfig] = {
-    # The shipped pilot-g1-simple. Blind, as the paper's row of that name: of slabs that differ by 2 cm, seen with 2 cm
-    # of noise, the map told the policy nothing, and an update without it takes half the time.
-    "simple": replace(SLABS, network=replace(SLABS.network, vision=False)),
-    # The full network, and ablations of the paper; the one without vision is "simple"
-    "slabs": SLABS,
-    "no-attention": replace(SLABS, network=replace(SLABS.network, attention=False)),
-    "no-moe": replace(SLABS, network=replace(SLABS.network, mixture=False)),
-    # The full network on flat ground, and ablations of this implementation's additions
-    "flat": FLAT,
-    "no-balance": replace(FLAT, environment=_environment(nominal=NominalConfig(balance_stiffness=0.0))),
-    "nominal-pose": replace(FLAT, environment=_environment(nominal=NominalConfig(kind="pose"))),
-    "nominal-default": replace(FLAT, environment=_environment(nominal=NominalConfig(kind="default"))),
-    "no-clock": replace(
-        FLAT,
-        environment=_environment(
-            nominal=NominalConfig(kind="pose", gait_clock=False),
-            rewards=replace(FLAT.environment.rewards, foot_phase=0.0),
-        ),
-    ),
-    "paper-weights": replace(FLAT, environment=_environment(rewards=PAPER_WEIGHTS)),
-    "soft-gains": replace(FLAT, environment=_environment(gains="soft")),
-    "no-mirror": replace(FLAT, ppo=replace(FLAT.ppo, symmetry="none")),
+    # Blind, as the paper's row of that name: of slabs that differ by 2 cm, seen with 2 cm of noise, the map tells the
+    # policy nothing, and an update without it takes half the time.
+    "simple": SIMPLE,
+    "no-moe": replace(SIMPLE, network=replace(SIMPLE.network, mixture=False)),
+    # With the elevation map, and the paper's ablation of its encoder
+    "vision": FULL_NETWORK,
+    "no-attention": replace(FULL_NETWORK, network=replace(FULL_NETWORK.network, attention=False)),
+    # Ablations of what this implementation adds
+    "paper-weights": replace(SIMPLE, stages=tuple(_paper_weights(stage) for stage in STAGES)),
+    "no-mirror": replace(SIMPLE, ppo=replace(SIMPLE.ppo, mirror_loss_weight=0.0)),
 }
 """Name to configuration, for ``train-lowlevel --preset``."""

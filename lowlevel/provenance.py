@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from lowlevel.files import atomic_write
 from lowlevel.plain import from_plain
 from lowlevel.trainer import STATE_FILE, TrainingConfig
+from robots.errors import PilotError
 
 RUN_FILE = "run.json"
 _PACKAGES = ("torch", "mujoco", "pin", "numpy", "stable-baselines3", "gymnasium")
@@ -60,18 +61,18 @@ def read_run_description(folder: Path) -> dict[str, Any]:
     """What :func:`write_run_description` wrote.
 
     Raises:
-        FileNotFoundError: if the folder holds no run.
-        ValueError: if the file is damaged.
+        PilotError: if the folder holds no run.
+        PilotError: if the file is damaged.
     """
     path = folder / RUN_FILE
     if not path.is_file():
-        raise FileNotFoundError(f"{folder} holds no {RUN_FILE}: give the folder of a training run")
+        raise PilotError(f"{folder} holds no {RUN_FILE}: give the folder of a training run")
     try:
         description = json.loads(path.read_text())
     except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+        raise PilotError(f"{path} is damaged: {error}") from error
     if not isinstance(description, dict):
-        raise ValueError(f"{path} is damaged: it does not hold a JSON object")
+        raise PilotError(f"{path} is damaged: it does not hold a JSON object")
     return description
 
 
@@ -79,14 +80,14 @@ def read_run_config(folder: Path, kind: type[Config]) -> Config:
     """The configuration, of class ``kind``, of an existing run; paths in it are text.
 
     Raises:
-        FileNotFoundError: if the folder holds no run.
-        ValueError: if the description is damaged or was written by another version.
+        PilotError: if the folder holds no run.
+        PilotError: if the description is damaged or was written by another version.
     """
     description = read_run_description(folder)
     try:
         return from_plain(kind, description["config"])
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder / RUN_FILE} does not describe a run of this version: {error}") from error
+        raise PilotError(f"{folder / RUN_FILE} does not describe a run of this version: {error}") from error
 
 
 def read_training_config(folder: Path) -> TrainingConfig:
@@ -98,39 +99,37 @@ def require_unused(folder: Path) -> None:
     """Check that a new run may use ``folder``.
 
     Raises:
-        FileExistsError: if it holds another one, saved or not.
+        PilotError: if it holds another one, saved or not.
     """
     if (folder / STATE_FILE).exists():
-        raise FileExistsError(
-            f"{folder} already holds a run: continue it with --resume {folder}, or give another --name"
-        )
+        raise PilotError(f"{folder} already holds a run: continue it with --resume {folder}, or give another --name")
     if (folder / RUN_FILE).exists():
-        raise FileExistsError(f"{folder} already holds a run that has saved nothing yet: give another --name")
+        raise PilotError(f"{folder} already holds a run that has saved nothing yet: give another --name")
 
 
 def make_run_folder(folder: Path) -> None:
     """Make the folder of a new run, and claim it: of two runs that ask for it at the same time one gets it.
 
     Raises:
-        OSError: if that is impossible.
-        FileExistsError: if another run was quicker.
+        PilotError: if that is impossible.
+        PilotError: if another run was quicker.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OSError(f"cannot make the folder {folder} ({error.strerror}): give another --output") from error
+        raise PilotError(f"cannot make the folder {folder} ({error.strerror}): give another --output") from error
     try:
         (folder / RUN_FILE).touch(exist_ok=False)
     except FileExistsError as error:
-        raise FileExistsError(f"another run has just begun in {folder}: give another --name") from error
+        raise PilotError(f"another run has just begun in {folder}: give another --name") from error
 
 
 def find_state(folder: Path) -> Path:
     """The file with the training state of an existing run.
 
     Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it is damaged.
+        PilotError: if there is none.
+        PilotError: if it is damaged.
     """
     path = folder / STATE_FILE
     if not path.is_file():
@@ -138,7 +137,7 @@ def find_state(folder: Path) -> Path:
         advice = (
             "the run ended before its first save, so start a new one" if is_run else "give the folder of a training run"
         )
-        raise FileNotFoundError(f"{folder} holds no {STATE_FILE}: {advice}")
+        raise PilotError(f"{folder} holds no {STATE_FILE}: {advice}")
     if not zipfile.is_zipfile(path):  # which is what torch.save writes
-        raise ValueError(f"{path} is not a readable training state: it is damaged or truncated")
+        raise PilotError(f"{path} is not a readable training state: it is damaged or truncated")
     return path

@@ -12,47 +12,46 @@ from torch import Tensor
 from lowlevel.checks import NonFiniteError
 from lowlevel.commands import STANDING_SPEED, is_walking
 from lowlevel.measures import Measurement, arm_error, height_error, stumbles, torso_error, velocity_error
-from robots.g1.constants import joint_index
+from lowlevel.rotations import rotate_about_vertical
+from robots.g1.constants import EFFORT, joint_index
 
 
 @dataclass(frozen=True)
 class RewardWeights:
-    """Weight per second of each term; names are those of :data:`REWARD_TERMS`."""
+    """Weight per second of each term; names are those of :data:`REWARD_TERMS`. Zero: the term is not computed."""
 
-    # Table I, task rewards; the paper's own weights are PAPER_WEIGHTS
-    linear_velocity: float = 6.0
-    angular_velocity: float = 6.0
-    base_height: float = 3.5
-    torso_orientation: float = 3.0
-    upper_body_position: float = 2.0
+    # Table I, task rewards
+    linear_velocity: float = 1.5
+    angular_velocity: float = 2.0
+    base_height: float = 1.0
+    torso_orientation: float = 1.0
+    upper_body_position: float = 1.0
     termination: float = -200.0
     # Table I, regularisation
     action_rate: float = -0.01
     energy: float = -0.001
-    joint_deviation: float = -0.2
+    joint_deviation: float = -0.5
     feet_stumble: float = -1.0
-    feet_air_time: float = 2.0
-    feet_slippage: float = -1.0
+    feet_air_time: float = 1.0
+    feet_slippage: float = -0.25
     large_feet_force: float = -0.005
     no_fly: float = 0.75
-    # Additions to the paper
-    foot_phase: float = 2.0
-    """Feet follow the gait clock: swing foot up, stance foot down."""
-    base_motion: float = -0.05
-    """Tumbling motion of the pelvis."""
-    velocity_progress: float = 4.0
-    """Share of the commanded horizontal velocity that is reached, up to all of it."""
-
-
-PAPER_WEIGHTS = RewardWeights(
-    linear_velocity=1.5,
-    angular_velocity=2.0,
-    base_height=1.0,
-    torso_orientation=1.0,
-    upper_body_position=1.0,
-    velocity_progress=1.0,
-)
-"""The paper's weights where the defaults are others: tracking counts for more here, and with it what is added to it."""
+    # Additions to the paper: tracking near its goal
+    linear_velocity_fine: float = 0.0
+    angular_velocity_fine: float = 0.0
+    velocity_progress: float = 0.0
+    # Additions: the shape of a gait, for as long as there is none
+    foot_phase: float = 0.0
+    contact_schedule: float = 0.0
+    swing_height: float = 0.0
+    foot_placement: float = 0.0
+    alive: float = 0.0
+    # Additions: what nothing above forbids
+    vertical_velocity: float = 0.0
+    base_motion: float = 0.0
+    feet_close: float = 0.0
+    stand_still: float = 0.0
+    torque_limits: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +66,8 @@ class Transition:
     nominal_target: Tensor
     phase: Tensor
     walking: Tensor
+    """Whether the gait clock runs (N,)."""
+    gait_frequency: float
     foot_air_time: Tensor
     foot_contact_time: Tensor
     fallen: Tensor
@@ -153,18 +154,93 @@ def large_feet_force(t: Transition) -> Tensor:
 
 def no_fly(t: Transition) -> Tensor:
     """Exactly one foot on the ground while marching, both while standing."""
-    return (t.measured.foot_contact.sum(-1) == torch.where(t.walking > 0.0, 1, 2)).float()
+    return (t.measured.foot_contact.sum(-1) == torch.where(t.walking, 1, 2)).float()
 
 
-SWING_HEIGHT = 0.08
-"""Height of the sole at mid-swing that :func:`foot_phase` asks for [m]."""
+SWING_HEIGHT = 0.09
+"""Height of the sole at mid-swing [m]."""
+STANCE_WIDTH = 0.24
+"""Distance of the feet across the heading [m]; that of the hips."""
 
 
-def foot_phase(t: Transition) -> Tensor:
-    """Kernel on the sole heights against the gait clock, variance 0.005 m^2."""
-    lift = torch.stack([torch.sin(t.phase), -torch.sin(t.phase)], dim=-1).clamp_min(0.0).square()
-    wanted = SWING_HEIGHT * lift * t.walking[:, None]
-    return torch.exp(-(t.measured.foot_clearance - wanted).square().sum(-1) / 0.005)
+def _lift(t: Transition) -> Tensor:
+    """Sine of each foot's swing (N, 2): 1 at mid-swing, negative in stance, 0 while standing."""
+    sine = torch.sin(t.phase)
+    return torch.stack([sine, -sine], dim=-1) * t.walking[:, None]
+
+
+def _feet_apart(t: Transition) -> Tensor:
+    """Left foot minus right foot in the heading frame (N, 2) [m]."""
+    feet = t.measured.robot.foot_position[..., :2]
+    return rotate_about_vertical(-t.measured.heading, feet[:, 0] - feet[:, 1])
+
+
+def foot_phase(t: Transition, variance: float = 0.003) -> Tensor:
+    """Kernel on the sole heights against the gait clock, ``variance`` [m^2]: swing foot up, stance foot down."""
+    wanted = SWING_HEIGHT * _lift(t).clamp_min(0.0).square()
+    return torch.exp(-(t.measured.foot_clearance - wanted).square().sum(-1) / variance)
+
+
+def contact_schedule(t: Transition) -> Tensor:
+    """Share of the feet that are loaded when the gait clock has them in stance, and only then."""
+    return (t.measured.foot_contact != (_lift(t) > 0.0)).float().mean(-1)
+
+
+def swing_height(t: Transition, height: float = 0.08) -> Tensor:
+    """How far swinging feet are lifted, as a share of ``height`` [m]."""
+    return ((t.measured.foot_clearance / height).clamp(0.0, 1.0) * (_lift(t) > 0.3)).sum(-1)
+
+
+def _sweep(phase: Tensor) -> Tensor:
+    """Where a foot is along its step, -1 behind to 1 ahead: it swings in (0, pi) and stays in (pi, 2 pi)."""
+    phase = torch.remainder(phase, 2.0 * torch.pi)
+    return torch.where(phase < torch.pi, -torch.cos(phase), 3.0 - 2.0 * phase / torch.pi)
+
+
+def foot_placement(t: Transition, variance: float = 0.02) -> Tensor:
+    """Kernel on the distance of the feet against the one that the told velocity needs, ``variance`` [m^2]."""
+    stride = (_sweep(t.phase) - _sweep(t.phase + torch.pi)) / (4.0 * t.gait_frequency)
+    wanted = t.command[:, :2] * stride[:, None]
+    wanted[:, 1] += STANCE_WIDTH
+    error = (_feet_apart(t) - wanted).square().sum(-1)
+    return torch.where(t.walking, torch.exp(-error / variance), 1.0)
+
+
+def alive(t: Transition) -> Tensor:
+    """One unless the robot falls."""
+    return 1.0 - t.fallen.float()
+
+
+def linear_velocity_fine(t: Transition, variance: float = 0.04) -> Tensor:
+    """Narrow Gaussian kernel on the horizontal velocity error, ``variance`` [m^2/s^2]."""
+    return torch.exp(-velocity_error(t.measured, t.command)[:, :2].square().sum(-1) / variance)
+
+
+def angular_velocity_fine(t: Transition, variance: float = 0.04) -> Tensor:
+    """Narrow Gaussian kernel on the yaw rate error, ``variance`` [rad^2/s^2]."""
+    return torch.exp(-velocity_error(t.measured, t.command)[:, 2].square() / variance)
+
+
+def vertical_velocity(t: Transition) -> Tensor:
+    """Squared vertical velocity of the pelvis while walking [m^2/s^2]; a squat is no fault."""
+    return t.measured.linear_velocity[:, 2].square() * t.walking
+
+
+def feet_close(t: Transition, distance: float = 0.15) -> Tensor:
+    """How much closer than ``distance`` [m] the feet are across the heading [m]."""
+    return (distance - _feet_apart(t)[:, 1]).clamp(0.0, 0.3)
+
+
+def stand_still(t: Transition) -> Tensor:
+    """Squared velocity of a robot told to stand [m^2/s^2, rad^2/s^2]: kernels have no slope at their top."""
+    moving = t.measured.linear_velocity[:, :2].square().sum(-1) + t.measured.yaw_rate.square()
+    return moving * ~t.walking
+
+
+def torque_limits(t: Transition, share: float = 0.8) -> Tensor:
+    """Torques beyond ``share`` of the motors' nominal limits, as a share of them, summed over joints."""
+    effort = torch.tensor(EFFORT, dtype=torch.float32, device=t.phase.device)
+    return (t.measured.robot.joint_torque.abs() / effort - share).clamp_min(0.0).sum(-1)
 
 
 def base_motion(t: Transition) -> Tensor:
@@ -184,27 +260,9 @@ def velocity_progress(t: Transition) -> Tensor:
 
 
 REWARD_TERMS: dict[str, Callable[[Transition], Tensor]] = {
-    term.__name__: term
-    for term in (
-        linear_velocity,
-        angular_velocity,
-        base_height,
-        torso_orientation,
-        upper_body_position,
-        termination,
-        action_rate,
-        energy,
-        joint_deviation,
-        feet_stumble,
-        feet_air_time,
-        feet_slippage,
-        large_feet_force,
-        no_fly,
-        foot_phase,
-        base_motion,
-        velocity_progress,
-    )
+    field.name: globals()[field.name] for field in fields(RewardWeights)
 }
+"""Terms by name."""
 
 
 def compute_rewards(

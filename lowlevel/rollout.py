@@ -34,29 +34,16 @@ def generalized_advantages(
 class RolloutStorage:
     """Preallocated tensors of one rollout, filled step by step and reused.
 
-    ``data`` holds one tensor (T, N, ...) per name. With ``images``, room for the mirror image of every sample
-    follows the rollout in the same memory, so that one index reaches both: :meth:`samples` has (2 T N, ...)
-    rows then.
+    ``data`` holds one tensor (T, N, ...) per name.
     """
 
-    def __init__(
-        self,
-        steps: int,
-        num_envs: int,
-        shapes: dict[str, tuple[int, ...]],
-        device: torch.device,
-        images: bool = False,
-    ) -> None:
+    def __init__(self, steps: int, num_envs: int, shapes: dict[str, tuple[int, ...]], device: torch.device) -> None:
         """``shapes``: the shape of one robot's entry at one step, per name; all entries are float32."""
         self.steps = steps
         self.num_envs = num_envs
         self.size = steps * num_envs
         self.position = 0
-        rows = self.size * (2 if images else 1)
-        self._samples = {name: torch.zeros(rows, *shape, device=device) for name, shape in shapes.items()}
-        self.data = {
-            name: rows[: self.size].view(steps, num_envs, *shapes[name]) for name, rows in self._samples.items()
-        }
+        self.data = {name: torch.zeros(steps, num_envs, *shape, device=device) for name, shape in shapes.items()}
         self.terminated = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
 
@@ -91,15 +78,7 @@ class RolloutStorage:
 
     def flat(self, name: str) -> Tensor:
         """What was recorded under ``name``, (T * N, ...), step-major; a view."""
-        return self._samples[name][: self.size]
-
-    def images(self, name: str) -> Tensor:
-        """The room for mirror images of ``name``, in the order of :meth:`flat`; a view, else empty."""
-        return self._samples[name][self.size :]
-
-    def samples(self, name: str) -> Tensor:
-        """Recorded rows of ``name`` followed by their mirror images, if any; a view."""
-        return self._samples[name]
+        return self.data[name].flatten(0, 1)
 
     def clear(self) -> None:
         """Start over; the tensors are reused."""

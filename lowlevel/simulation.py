@@ -17,7 +17,8 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from robots.g1.constants import HAND_BODIES, JOINT_NAMES, PELVIS_BODY, SIDES, TORSO_BODY
+from robots.errors import PilotError
+from robots.g1.constants import BODY_POINTS, HAND_BODIES, JOINT_NAMES, PELVIS_BODY, SIDES, TORSO_BODY
 from robots.g1.model import joint_limits
 
 
@@ -49,6 +50,8 @@ class RobotState:
     """Net contact force on each foot (N, 2, 3) [N]."""
     palm_position: Tensor
     """(N, 2, 3) [m]."""
+    body_points: Tensor
+    """Centres of :data:`robots.g1.constants.BODY_POINTS` (N, 7, 3) [m]."""
     palm_quaternion: Tensor
     """(N, 2, 4) wxyz."""
 
@@ -136,6 +139,7 @@ class BatchSimulation:
             # The sensor reports the force that the foot exerts on the ground.
             foot_force=-pair("foot", "force"),
             palm_position=pair("palm", "position"),
+            body_points=torch.stack([sensor(f"{point.name}_point_position") for point in BODY_POINTS], dim=1),
             palm_quaternion=pair("palm", "quaternion"),
         )
 
@@ -146,6 +150,26 @@ class BatchSimulation:
         """
         self._ctrl[:, self._actuators] = targets.detach().cpu().numpy()
         self._batch.step(nstep=self.decimation)
+        self._find_diverged()
+
+    def step_with_work(self, targets: Tensor, ids: Tensor) -> Tensor:
+        """As :meth:`step` for robots ``ids`` (n,), and the work of all motors (N,) [J], both signs counted positive.
+
+        It is added up over the physics steps: what a joint trembles between two control steps counts, too.
+        """
+        self._ctrl[:, self._actuators] = targets.detach().cpu().numpy()
+        rows = ids.cpu().numpy()
+        work = np.zeros(self.num_robots)
+        for _ in range(self.decimation):
+            before = self._qpos[rows, self._joint_qpos]
+            self._batch.step(rows)
+            # The torque of a physics step is constant over it.
+            moved = self._qpos[rows, self._joint_qpos] - before
+            work[rows] += np.abs(self._torque[rows, self._actuators] * moved).sum(axis=1)
+        self._find_diverged()
+        return torch.from_numpy(work)
+
+    def _find_diverged(self) -> None:
         # A sum is finite only if all of its terms are.
         self._diverged = ~np.isfinite(self._batch.state.sum(axis=1))
         if self._diverged.any():
@@ -228,10 +252,10 @@ class BatchSimulation:
         """Restore :meth:`state_dict`.
 
         Raises:
-            ValueError: if it was saved with another model or number of robots.
+            PilotError: if it was saved with another model or number of robots.
         """
         if state["state"].shape != self._batch.state.shape:
-            raise ValueError(
+            raise PilotError(
                 f"the saved simulation has shape {tuple(state['state'].shape)}, this one "
                 f"{self._batch.state.shape}: resume with the number of robots and the terrain of the saved run"
             )

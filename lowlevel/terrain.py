@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from lowlevel.rotations import rotate_about_vertical
+from robots.errors import PilotError
 from robots.g1.mirror import Mirror
 from robots.g1.model import WORLD_COLLISION
 
@@ -84,7 +85,7 @@ class Terrain:
     def __init__(self, config: TerrainConfig, device: torch.device | str = "cpu") -> None:
         unknown = [tile for tile in config.tiles if tile not in TILES]
         if unknown:
-            raise ValueError(f"unknown terrain tile {unknown[0]!r}; choose from {', '.join(TILES)}")
+            raise PilotError(f"unknown terrain tile {unknown[0]!r}; choose from {', '.join(TILES)}")
         self.config = config
         rng = np.random.default_rng(config.seed)
         size = config.tile_size

@@ -13,7 +13,8 @@ import torch
 import tyro
 
 from lowlevel import distributed
-from lowlevel.checks import NonFiniteError, require_finite
+from lowlevel.checks import require_finite
+from lowlevel.command_line import command_line
 from lowlevel.export import export_controller
 from lowlevel.presets import PRESETS
 from lowlevel.provenance import (
@@ -25,7 +26,8 @@ from lowlevel.provenance import (
     require_unused,
     write_run_description,
 )
-from lowlevel.trainer import Trainer, TrainingConfig, read_training_state
+from lowlevel.trainer import Trainer, TrainingConfig
+from robots.errors import PilotError
 
 
 @dataclass(frozen=True)
@@ -41,21 +43,12 @@ class Arguments:
     """Name of the run's folder; preset and time by default."""
     resume: Path | None = None
     """Folder of a run to continue with its own configuration; options given beside it replace parts of that."""
-    warm_start: Path | None = None
-    """Folder of a run whose networks, optimisers and curriculum a new run starts from, and, unless a preset is given,
-    its configuration; options given beside it replace parts of that."""
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``train-lowlevel``."""
-    try:
+    with command_line("train-lowlevel", "interrupted; what was saved by then can be continued with --resume"):
         _run(sys.argv[1:] if arguments is None else arguments)
-    except (ValueError, OSError, NonFiniteError) as error:
-        first_line, _, _ = str(error).partition("\n")
-        sys.exit(f"train-lowlevel: {first_line}")
-    except KeyboardInterrupt:
-        print("train-lowlevel: interrupted; what was saved by then can be continued with --resume", file=sys.stderr)
-        sys.exit(130)
 
 
 def _run(arguments: list[str]) -> None:
@@ -66,6 +59,7 @@ def _run(arguments: list[str]) -> None:
         description="Train a PILOT controller. Defaults below are those of the chosen preset or earlier run.",
     )
     device = distributed.start(parsed.config.device)
+    torch.set_float32_matmul_precision("medium")
     # Physics and learning take turns on the same cores.
     torch.set_num_threads(max(1, parsed.config.environment.num_threads))
     try:
@@ -75,11 +69,11 @@ def _run(arguments: list[str]) -> None:
             print(f"training in {trainer.folder}", flush=True)
         trainer.train()
         if distributed.rank() == 0:
-            export_controller(trainer, trainer.folder / "controller")
-            print(
-                f"{trainer.steps} steps in {trainer.trained_seconds / 3600:.2f} h; the controller lies in "
-                f"{trainer.folder / 'controller'}"
-            )
+            outcome = f"no controller yet: the stage {trainer.stage.name!r} has a gait prior"
+            if trainer.stage.gait_prior == 0.0:
+                export_controller(trainer, trainer.folder / "controller")
+                outcome = f"the controller lies in {trainer.folder / 'controller'}"
+            print(f"{trainer.steps} steps in {trainer.trained_seconds / 3600:.2f} h; {outcome}")
         if trainer.steps < parsed.config.total_steps:
             print(f"train-lowlevel: stopped; continue with --resume {trainer.folder}", file=sys.stderr)
             sys.exit(130)
@@ -92,20 +86,15 @@ def _defaults(arguments: list[str]) -> Arguments:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset")
     parser.add_argument("--resume", type=Path)
-    parser.add_argument("--warm-start", type=Path)
     chosen = parser.parse_known_args(arguments)[0]
     if chosen.resume is not None:
         if chosen.preset is not None:
-            raise ValueError("--resume takes the configuration of the run it continues: leave --preset out")
+            raise PilotError("--resume takes the configuration of the run it continues: leave --preset out")
         config = read_training_config(chosen.resume)
         return Arguments(config=config, preset=read_run_description(chosen.resume).get("preset", "unknown"))
-    if chosen.warm_start is not None and chosen.preset is None:
-        find_state(chosen.warm_start)
-        config = read_training_config(chosen.warm_start)
-        return Arguments(config=config, preset=read_run_description(chosen.warm_start).get("preset", "unknown"))
     preset = chosen.preset or Arguments.preset
     if preset not in PRESETS:
-        raise ValueError(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}")
+        raise PilotError(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}")
     return Arguments(config=PRESETS[preset], preset=preset)
 
 
@@ -114,8 +103,6 @@ def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
     if distributed.rank() == 0:  # other ranks may come when this one has made the folder
         require_unused(folder)
     trainer = Trainer(replace(parsed.config, device=str(device)), folder)
-    if parsed.warm_start:
-        _load(trainer, parsed.warm_start, learning_only=True)
     if distributed.rank() == 0:
         make_run_folder(folder)
     return trainer
@@ -123,23 +110,18 @@ def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
 
 def _resumed(parsed: Arguments) -> Trainer:
     assert parsed.resume is not None
-    if parsed.warm_start:
-        raise ValueError("--warm-start begins a new run and --resume continues one: give only one of them")
     trainer = Trainer(parsed.config, parsed.resume)
     _load(trainer, parsed.resume)
     return trainer
 
 
-def _load(trainer: Trainer, run: Path, learning_only: bool = False) -> None:
-    """Continue from the training state of a run, or take over only what it has learned."""
+def _load(trainer: Trainer, run: Path) -> None:
+    """Continue from the training state of a run."""
     path = find_state(run)
     try:
-        if learning_only:
-            trainer.load_learning(read_training_state(path))
-        else:
-            trainer.load(path)
+        trainer.load(path)
     except KeyError as error:
-        raise ValueError(f"{path} is not a training state of this version: it has no {error}") from error
+        raise PilotError(f"{path} is not a training state of this version: it has no {error}") from error
     for network in (trainer.ppo.actor, trainer.ppo.critic):
         for name, weight in network.state_dict().items():
             require_finite(f"weight {name!r} in {path}", weight)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+import tyro
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from lowlevel.curriculum import STAGES, Curriculum, CurriculumConfig
+from lowlevel.absorption import AbsorptionConfig, absorb_prior
+from lowlevel.commands import shares
+from lowlevel.curriculum import Curriculum, CurriculumConfig
 from lowlevel.distributed import any_rank, average_over_ranks, rank, world_size
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
 from lowlevel.files import atomic_write
@@ -32,18 +35,20 @@ from lowlevel.observation import (
 )
 from lowlevel.ppo import PPO, PPOConfig
 from lowlevel.progress import ProgressReport
+from lowlevel.stages import Stage
 from lowlevel.terrain import MAP_SIZE
 from lowlevel.training_log import LOG_FILE, drop_entries_after, write_entry
-from robots.g1.constants import NUM_JOINTS
+from robots.errors import PilotError
+from robots.g1.constants import LOWER_JOINTS, NUM_JOINTS
 
 STATE_FILE = "training_state.pt"
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """A training run: task, networks, learner and curriculum."""
+    """A training run: task, stages, networks, learner and curriculum."""
 
-    total_steps: int = 25_000_000
+    total_steps: int = 400_000_000
     """Environment steps (robots times control steps), over all ranks."""
     seed: int = 0
     """Seed of weights, noise, commands and randomisation."""
@@ -55,6 +60,9 @@ class TrainingConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    absorption: AbsorptionConfig = field(default_factory=AbsorptionConfig)
+    stages: Annotated[tuple[Stage, ...], tyro.conf.Suppress] = (Stage(),)
+    """Run one after the other."""
 
 
 def observation_sizes() -> ObservationSizes:
@@ -96,14 +104,7 @@ class Trainer:
     def __init__(self, config: TrainingConfig, folder: Path) -> None:
         self.config = config
         self.folder = folder
-        for stage in STAGES:
-            if getattr(config.environment.rewards, stage.reward) == 0.0:
-                raise ValueError(
-                    f"the curriculum opens {stage.name} by the reward {stage.reward}: its weight must not be 0"
-                )
-        self.environment = PilotEnvironment(config.environment, seed=config.seed + 7919 * rank(), device="cpu")
         self.curriculum = Curriculum(config.curriculum)
-        self.environment.open_range = self.curriculum.open_range
         self.ppo = PPO(
             config=config.ppo,
             network_config=config.network,
@@ -117,9 +118,55 @@ class Trainer:
         )
         self.steps = 0
         self.trained_seconds = 0.0
-        self.fall_rate = 1.0
+        self.fall_rate = 0.05
         self.observation: dict[str, Tensor] = {}
         self._stop_requested = False
+        self._begin_stage(0)
+
+    # -- stages -----------------------------------------------------------------------------------------------
+
+    def _begin_stage(self, number: int) -> None:
+        """Set up the task and the learner as stage ``number`` has them; the robots start anew."""
+        self.stage_number = number
+        self.stage_begin = self.steps
+        self.waited_for = 0.0
+        stage = self.stage
+        seed = self.config.seed + 7919 * rank() + 104729 * number
+        self.environment = PilotEnvironment(stage.environment(self.config.environment), seed=seed, device="cpu")
+        self._shares = shares(stage.mixture)
+        acting = NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop
+        self.ppo.enter(stage.std, acting, stage.rollout_doublings)
+        self._apply_curriculum()
+        self.observation = {}
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that runs."""
+        return self.config.stages[self.stage_number]
+
+    def _apply_curriculum(self) -> None:
+        self.environment.opening = self.curriculum.opening
+        self.environment.kind_probability = self.curriculum.probabilities(self._shares)
+
+    def _follow_stages(self, figures: dict[str, float], report: Callable[[str], None]) -> None:
+        """Begin the next stage once the figure that this one waits for is reached, or its steps are used up."""
+        stage = self.stage
+        if self.stage_number + 1 == len(self.config.stages):
+            return
+        if stage.waits_for:
+            self.waited_for += 0.1 * (figures[stage.waits_for] - self.waited_for)
+        taken = self.steps - self.stage_begin
+        reached = bool(stage.waits_for) and self.waited_for > stage.above and taken >= stage.least_steps
+        if not reached and taken < stage.most_steps:
+            return
+        self.save()
+        self._begin_stage(self.stage_number + 1)
+        if stage.gait_prior > 0.0 and self.stage.gait_prior == 0.0:
+            self.observation = absorb_prior(
+                self.ppo, self.environment, stage.gait_prior, self.config.absorption, report
+            )
+        else:
+            self.observation = self.environment.reset(spread_episodes=True)
 
     # -- the loop ---------------------------------------------------------------------------------------------
 
@@ -139,6 +186,7 @@ class Trainer:
                 self.trained_seconds += seconds
                 figures["speed/steps_per_second"] = self._steps_per_iteration / seconds
                 log(figures)
+                self._follow_stages(figures, lambda text: progress.update(task, description=text))
                 progress.update(task, completed=self.steps, description=self._headline(figures))
                 if time.monotonic() - last_save > self.config.save_interval:
                     self.save()
@@ -152,15 +200,13 @@ class Trainer:
     def iterate(self) -> dict[str, float]:
         """One rollout and one update; returns figures to log."""
         terms, tracking, falls = Averages(), Averages(), Averages()
-        share = min(self.steps / self.config.total_steps, 1.0)
-        self.ppo.calm(share)
-        self.ppo.lengthen(share)
         started = time.monotonic()
         for _ in range(self.ppo.storage.steps):
             action = self.ppo.act(self.observation)
-            result = self.environment.step(action.cpu(), self.ppo.estimated_velocity.cpu())
+            result = self.environment.step(action.cpu())
             self.ppo.record(result.reward, result.terminated, result.truncated, result.next_privileged)
             self.observation = result.observation
+            self.curriculum.observe(result.kind, result.terms, result.terminated)
             terms.add(result.terms | {"total": result.reward / self.environment.control_period})
             falls.add({"share": result.terminated})
             tracking.add(_tracking(result))
@@ -170,17 +216,15 @@ class Trainer:
 
         mean_terms = terms.take()
         fallen = falls.take()["share"]
-        if self.ppo.updates == 1:
-            self.fall_rate = fallen
-        else:
-            self.fall_rate += 0.1 * (fallen - self.fall_rate)
+        self.fall_rate += 0.1 * (fallen - self.fall_rate)
         # No more than were taken: a run that has not fallen yet does not stand for ever.
         steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
-        self.curriculum.update(mean_terms, min(steps_between_falls / self.environment.max_steps, 1.0))
-        self.environment.open_range = self.curriculum.open_range
+        self.curriculum.update()
+        self._apply_curriculum()
         figures = {f"reward/{name}": value for name, value in mean_terms.items()}
         figures |= {f"tracking/{name}": value for name, value in tracking.take().items()}
-        figures |= {f"curriculum/{name}": value for name, value in asdict(self.curriculum.open_range).items()}
+        figures |= {f"curriculum/{name}": value for name, value in self.curriculum.figures(self._shares).items()}
+        figures["curriculum/stage"] = float(self.stage_number)
         figures |= {f"learner/{name}": value for name, value in losses.items()}
         figures["episode/steps_between_falls"] = steps_between_falls
         figures["speed/collection_seconds"] = collection_seconds
@@ -198,6 +242,10 @@ class Trainer:
             "steps": self.steps,
             "trained_seconds": self.trained_seconds,
             "fall_rate": self.fall_rate,
+            "action_scale": self.environment.action_scale.cpu(),
+            "stage": self.stage_number,
+            "stage_begin": self.stage_begin,
+            "waited_for": self.waited_for,
         }
 
     def save(self) -> Path:
@@ -209,38 +257,39 @@ class Trainer:
         return path
 
     def load(self, path: Path, with_environment: bool = True) -> None:
-        """Continue from a training state that :meth:`save` wrote; without its environment the robots start anew.
+        """Continue from a training state that :meth:`save` wrote; where it has no environment the robots start anew.
 
         The state is rank 0's: the robots of other ranks always start anew.
 
         Raises:
-            ValueError: if the file is damaged or belongs to another configuration.
+            PilotError: if the file is damaged or belongs to another configuration.
         """
         state = read_training_state(path)
-        self.load_learning(state)
-        if with_environment and rank() == 0:
-            self.environment.load_state_dict(state["environment"])
-            self.observation = state["observation"]
-        self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
-
-    def load_learning(self, state: dict[str, Any]) -> None:
-        """Take over weights, optimisers and curriculum, but not the simulation (warm start of another preset)."""
+        if not torch.equal(state["action_scale"], self.environment.action_scale.cpu()):
+            raise PilotError(f"{path} was trained with other action scales than those of these gains: train anew")
         try:
             self.ppo.load_state_dict(state["ppo"])
         except (KeyError, RuntimeError, ValueError) as error:
             # torch lists every difference in a line of its own, below a heading
             lines = [line.strip() for line in str(error).splitlines()]
             details = [line for line in lines if not line.endswith(":")] or lines
-            raise ValueError(f"the training state belongs to other networks: {' '.join(details)}") from error
+            raise PilotError(f"the training state belongs to other networks: {' '.join(details)}") from error
         self.curriculum.load_state_dict(state["curriculum"])
-        self.environment.open_range = self.curriculum.open_range
+        self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
         self.fall_rate = float(state["fall_rate"])
+        self._begin_stage(int(state["stage"]))
+        self.stage_begin, self.waited_for = int(state["stage_begin"]), float(state["waited_for"])
+        if with_environment and rank() == 0 and "environment" in state:
+            self.environment.load_state_dict(state["environment"])
+            self.observation = state["observation"]
 
     # -- progress ---------------------------------------------------------------------------------------------
 
     def _headline(self, figures: dict[str, float]) -> str:
+        stage = self.stage
+        waits = f" until {stage.waits_for} {self.waited_for:.2f} > {stage.above:g}" if stage.waits_for else ""
         return (
-            f"falls every {figures['episode/steps_between_falls']:.0f} steps"
+            f"{stage.name}{waits}  falls every {figures['episode/steps_between_falls']:.0f} steps"
             f"  E_v {figures['tracking/E_v']:.2f}  {figures['speed/steps_per_second']:.0f} steps/s"
         )
 
@@ -274,13 +323,13 @@ def read_training_state(path: Path) -> dict[str, Any]:
     """Contents of a training state; only tensors and plain values are ever unpickled.
 
     Raises:
-        ValueError: if the file is damaged.
+        PilotError: if the file is damaged.
     """
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, EOFError, OSError, ValueError, UnpicklingError) as error:
         first_line = str(error).splitlines()[0]
-        raise ValueError(f"{path} is not a readable training state: {first_line}") from error
+        raise PilotError(f"{path} is not a readable training state: {first_line}") from error
 
 
 def _tracking(result: StepResult) -> dict[str, Tensor]:

@@ -9,10 +9,10 @@ import torch
 
 from evaluation.pictures import NoOpenGLError, find_platform
 from lowlevel.commands import command_space
-from lowlevel.controller import Controller, ControllerConfig, actor_sizes
+from lowlevel.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
 from lowlevel.networks import NetworkConfig, PilotActor
-from lowlevel.nominal_config import NominalConfig
 from lowlevel.observation import FRAME, normalised_columns
+from lowlevel.reference import ReferenceConfig
 from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
 from robots.g1.model import build_spec, joint_limits
 from robots.g1.nominal_pose import NominalPose
@@ -48,11 +48,9 @@ def untrained_controller(tmp_path_factory: pytest.TempPathFactory) -> Path:
         action_limit=8.0,
         control_period=0.02,
         command_space=command_space(limits[:, 0].tolist(), limits[:, 1].tolist()),
-        nominal=NominalConfig(),
-        network=network,
-        pose_axes=pose.axes,
     )
+    policy = PolicyConfig(ReferenceConfig(), network, pose.axes)
     actor = PilotActor(actor_sizes(), network, ~normalised_columns(FRAME))
     folder = tmp_path_factory.mktemp("controllers") / "untrained"
-    Controller(config, actor, pose, provenance={}).save(folder)
+    save_controller(folder, config, policy, build_step(config, policy, actor, pose, "cpu"), provenance={})
     return folder

@@ -1,7 +1,4 @@
-"""Where the arms' mass is, and what it takes to hold it up, for any arm posture, batched.
-
-A G1's arms weigh 7 kg of 33: reaching out moves the centre of mass by centimetres, which the feet must follow.
-"""
+"""What it takes to hold up the arms in any posture, batched. They weigh 7 kg of the G1's 33."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ _ARM_LENGTH = 7
 
 
 class ArmMass:
-    """First moment of both arms' mass about the torso frame's origin, and static torques of their joints.
+    """Static torques of the joints of both arms.
 
     Links are summed from the hand inwards: a link's subtree has its moment in its own frame, which the joint's
     rotation and offset carry into the frame of the link before it. That step is affine in the moment of the links
@@ -55,12 +52,8 @@ class ArmMass:
         angles = arms.T.unflatten(0, (2, 1, 1, _ARM_LENGTH)).transpose(0, 3).contiguous()
         return blend(self._basis, angles).unbind()
 
-    def first_moment(self, arms: Tensor) -> Tensor:
-        """Sum of mass times position (N, 3) [kg m] in the torso frame, for 14 arm joints ``arms`` (N, 14) [rad]."""
-        return _carried_inwards(self._steps(arms))[0].sum(dim=1).T
-
-    def first_moment_and_torque(self, arms: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
-        """The first moment, and the joint torques (N, 14) [N m] that hold the arms up.
+    def holding_torque(self, arms: Tensor, gravity: Tensor) -> Tensor:
+        """Joint torques (N, 14) [N m] that hold up arms at ``arms`` (N, 14) [rad].
 
         ``gravity`` (N, 3) [m/s^2]: in the torso frame.
         """
@@ -73,7 +66,7 @@ class ArmMass:
             pulls.append(pull)
         about_joints = torch.stack(moments) - self._lever
         torque = -(self._axis * torch.linalg.cross(about_joints, torch.stack(pulls), dim=1)).sum(1)
-        return moments[0].sum(dim=1).T, torque.transpose(0, 1).flatten(0, 1).T
+        return torque.transpose(0, 1).flatten(0, 1).T
 
 
 def _carried_inwards(steps: tuple[Tensor, ...]) -> list[Tensor]:

@@ -22,6 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
+from robots.errors import PilotError
+
 
 class Motor(Enum):
     """Actuator type; the value is the reflected rotor inertia (armature) [kg m^2] and the largest torque [N m]."""
@@ -80,7 +82,6 @@ JOINTS: tuple[Joint, ...] = (*_leg("left"), *_leg("right"), *_WAIST, *_arm("left
 JOINT_NAMES: tuple[str, ...] = tuple(joint.name for joint in JOINTS)
 NUM_JOINTS = len(JOINTS)
 
-LEG_JOINTS = slice(0, 12)
 WAIST_JOINTS = slice(12, 15)
 LOWER_JOINTS = slice(0, 15)
 """Legs and waist: the joints that carry the body."""
@@ -107,6 +108,28 @@ PALM_HALF_THICKNESS = 0.012
 """Of the palm plates [m]: the surface that touches lies this far from the palm centre along the palm normal."""
 PALM_OFFSET = (0.09, 0.0, 0.0)
 """Palm centre in the wrist-yaw frame [m]; the palm normal is -y on the left hand, +y on the right."""
+
+
+@dataclass(frozen=True)
+class BodyPoint:
+    """A ball that stands for a part of the robot: centre in the frame of ``body`` [m], and ``radius`` [m]."""
+
+    name: str
+    body: str
+    center: tuple[float, float, float]
+    radius: float
+
+
+BODY_POINTS: tuple[BodyPoint, ...] = (
+    BodyPoint("pelvis", PELVIS_BODY, (0.0, 0.0, 0.0), 0.12),
+    BodyPoint("torso", TORSO_BODY, (0.0, 0.0, 0.2), 0.12),
+    BodyPoint("head", TORSO_BODY, (0.0, 0.0, 0.43), 0.08),
+    BodyPoint("left_knee", "left_knee_link", (0.0, 0.0, 0.0), 0.06),
+    BodyPoint("right_knee", "right_knee_link", (0.0, 0.0, 0.0), 0.06),
+    BodyPoint("left_elbow", "left_elbow_link", (0.0, 0.0, 0.0), 0.05),
+    BodyPoint("right_elbow", "right_elbow_link", (0.0, 0.0, 0.0), 0.05),
+)
+"""What never reaches the ground unless the robot falls."""
 TOTAL_MASS = 33.341
 """Mass of all links in the URDF [kg]."""
 
@@ -115,10 +138,10 @@ def joint_index(name: str) -> int:
     """Index of a joint in Unitree's order.
 
     Raises:
-        ValueError: if the robot has no joint of that name.
+        PilotError: if the robot has no joint of that name.
     """
     if name not in JOINT_NAMES:
-        raise ValueError(f"the G1 has no joint named {name!r}; its joints are {', '.join(JOINT_NAMES)}")
+        raise PilotError(f"the G1 has no joint named {name!r}; its joints are {', '.join(JOINT_NAMES)}")
     return JOINT_NAMES.index(name)
 
 
@@ -149,7 +172,7 @@ def _armature_gains() -> Gains:
 STIFF_GAINS = Gains(
     stiffness=_per_joint((150, 150, 150, 300, 40, 40), (200, 200, 200), (80, 80, 80, 80, 40, 40, 40)),
     damping=_per_joint((5, 5, 5, 8, 2, 2), (5, 5, 5), (3, 3, 3, 3, 1.5, 1.5, 1.5)),
-    action_scale=_per_joint((1 / 6, 1 / 6, 1 / 6, 0.125, 0.25, 0.25), (0.25,) * 3, (0.08,) * 7),
+    action_scale=_per_joint((1 / 6, 1 / 6, 1 / 6, 0.125, 0.25, 0.25), (0.12,) * 3, (0.08,) * 7),
 )
 SOFT_GAINS = _armature_gains()
 GAINS: dict[str, Gains] = {"stiff": STIFF_GAINS, "soft": SOFT_GAINS}
@@ -159,10 +182,10 @@ def gain_set(name: str) -> Gains:
     """A gain set of :data:`GAINS` by name.
 
     Raises:
-        ValueError: if there is none of that name.
+        PilotError: if there is none of that name.
     """
     if name not in GAINS:
-        raise ValueError(f"unknown gain set {name!r}; choose one of {', '.join(GAINS)}")
+        raise PilotError(f"unknown gain set {name!r}; choose one of {', '.join(GAINS)}")
     return GAINS[name]
 
 
@@ -170,7 +193,7 @@ def urdf_path() -> Path:
     """Path of the G1 URDF that the ``example-robot-data`` package installs.
 
     Raises:
-        FileNotFoundError: if the package is missing or does not contain the robot.
+        PilotError: if the package is missing or does not contain the robot.
     """
     name = "g1_29dof_rev_1_0.urdf"
     try:
@@ -180,4 +203,4 @@ def urdf_path() -> Path:
     for file in files:
         if file.name == name:
             return Path(str(file.locate())).resolve()
-    raise FileNotFoundError(f"{name} not found: install the robot with 'pip install example-robot-data'")
+    raise PilotError(f"{name} not found: install the robot with 'pip install example-robot-data'")

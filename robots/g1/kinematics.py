@@ -18,6 +18,7 @@ import functools
 import numpy as np
 import pinocchio as pin
 
+from robots.errors import PilotError
 from robots.g1.constants import (
     ARMATURE,
     FOOT_BODIES,
@@ -45,13 +46,13 @@ def build_model() -> pin.Model:
     Built once and shared: copy it before changing it.
 
     Raises:
-        FileNotFoundError: if the URDF is not installed.
-        ValueError: if the URDF's joints are not those of :data:`robots.g1.constants.JOINT_NAMES`.
+        PilotError: if the URDF is not installed.
+        PilotError: if the URDF's joints are not those of :data:`robots.g1.constants.JOINT_NAMES`.
     """
     path = urdf_path()
     model = pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
     if tuple(model.names)[2:] != JOINT_NAMES:
-        raise ValueError(f"{path} is not the 29-joint G1: its joints are {', '.join(list(model.names)[2:])}")
+        raise PilotError(f"{path} is not the 29-joint G1: its joints are {', '.join(list(model.names)[2:])}")
     for palm, hand in zip(PALM_FRAMES, HAND_BODIES, strict=True):
         hand_id = model.getFrameId(hand)
         wrist = model.frames[hand_id]

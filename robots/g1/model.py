@@ -15,6 +15,7 @@ import numpy as np
 
 from robots.g1.constants import (
     ARMATURE,
+    BODY_POINTS,
     EFFORT,
     FOOT_BODIES,
     HAND_BODIES,
@@ -82,6 +83,7 @@ def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:
     _add_feet(spec, options)
     _add_palms(spec, options)
     _add_self_collision(spec)
+    _add_body_points(spec)
     _add_sensors(spec)
     return spec
 
@@ -205,6 +207,15 @@ def _add_self_collision(spec: mujoco.MjSpec) -> None:
 
 def _add_pair(spec: mujoco.MjSpec, first: str, second: str) -> None:
     spec.add_pair(geomname1=first, geomname2=second, condim=1)
+
+
+def _add_body_points(spec: mujoco.MjSpec) -> None:
+    """A site and a position sensor for each of :data:`BODY_POINTS`."""
+    for point in BODY_POINTS:
+        name = f"{point.name}_point"
+        spec.body(point.body).add_site(name=name, pos=list(point.center))
+        position = mujoco.mjtSensor.mjSENS_FRAMEPOS
+        spec.add_sensor(name=f"{name}_position", type=position, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=name)
 
 
 def _add_sensors(spec: mujoco.MjSpec) -> None:

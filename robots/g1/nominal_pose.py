@@ -19,11 +19,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from robots.errors import PilotError
+
 PATH = Path(__file__).with_name("nominal_pose.npz")
 """The table shipped with the package."""
 
 NUM_LOWER_JOINTS = 15
-NUM_LEG_JOINTS = 12
 
 
 class NominalStance(NamedTuple):
@@ -34,8 +35,6 @@ class NominalStance(NamedTuple):
     torque: Tensor
     """What holds them against gravity with the weight on both feet (N, 15) [N m]: PD targets of position +
     torque / stiffness do not sag."""
-    shift: Tensor
-    """Change of the leg joints (N, 12, 2) [rad/m] that moves the pelvis along x and y over the standing feet."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +90,8 @@ class NominalPose:
     ) -> None:
         """``axes``: height [m], roll, pitch, yaw [rad] of the posture grid.
 
-        ``values`` (nodes, 54): joint positions [rad] and static gravity torques [N m] of the 15 leg and waist joints,
-        shift of the 12 leg joints [rad/m]. ``roll_limit`` (nodes of height x |yaw|, 1) and ``pitch_limits`` (nodes of
+        ``values`` (nodes, 30): joint positions [rad] and static gravity torques [N m] of the 15 leg and waist joints.
+        ``roll_limit`` (nodes of height x |yaw|, 1) and ``pitch_limits`` (nodes of
         height x |roll| x |yaw|, 2) bound the postures that can be held [rad].
         """
         self.axes, self.values, self.roll_limit, self.pitch_limits = axes, values, roll_limit, pitch_limits
@@ -109,12 +108,12 @@ class NominalPose:
         """Read the table.
 
         Raises:
-            FileNotFoundError: if there is no file at ``path``.
-            ValueError: if the file is not a nominal-pose table.
+            PilotError: if there is no file at ``path``.
+            PilotError: if the file is not a nominal-pose table.
         """
         remedy = "regenerate it with 'python -m robots.g1.nominal_pose_solver'"
         if not path.is_file():
-            raise FileNotFoundError(f"the nominal-pose table {path} is missing: {remedy}")
+            raise PilotError(f"the nominal-pose table {path} is missing: {remedy}")
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
@@ -122,16 +121,16 @@ class NominalPose:
             grid = (len(height), len(roll), len(pitch), len(yaw))
             half = (len(height), len(roll) // 2 + 1, len(yaw) // 2 + 1)
             nodes = int(np.prod(grid))
-            columns = [arrays[name].reshape(nodes, -1) for name in ("positions", "torques", "shifts")]
-            values = np.concatenate(columns, axis=-1).reshape(nodes, 2 * NUM_LOWER_JOINTS + 2 * NUM_LEG_JOINTS)
+            columns = [arrays[name].reshape(nodes, -1) for name in ("positions", "torques")]
+            values = np.concatenate(columns, axis=-1).reshape(nodes, 2 * NUM_LOWER_JOINTS)
             roll_limit = arrays["roll_limit"].reshape(half[0] * half[2], 1)
             pitch_limits = arrays["pitch_limits"].reshape(int(np.prod(half)), 2)
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} is not a nominal-pose table ({error}): {remedy}") from error
+            raise PilotError(f"{path} is not a nominal-pose table ({error}): {remedy}") from error
 
         def tensor(array: np.ndarray) -> Tensor:
             if not np.isfinite(array).all():
-                raise ValueError(f"the nominal-pose table {path} holds numbers that are not finite: {remedy}")
+                raise PilotError(f"the nominal-pose table {path} holds numbers that are not finite: {remedy}")
             return torch.as_tensor(array, dtype=torch.float32, device=device)
 
         axes = tuple(Axis(float(axis[0]), float(axis[-1]), len(axis)) for axis in (height, roll, pitch, yaw))
@@ -140,8 +139,7 @@ class NominalPose:
     def lookup(self, posture: Tensor) -> NominalStance:
         """The stance for each ``posture`` (N, 4); postures outside the grid are moved to its border."""
         values = self._stance(posture)
-        position, torque, shift = values.split([NUM_LOWER_JOINTS, NUM_LOWER_JOINTS, 2 * NUM_LEG_JOINTS], dim=1)
-        return NominalStance(position, torque, shift.unflatten(1, (NUM_LEG_JOINTS, 2)))
+        return NominalStance(*values.split(NUM_LOWER_JOINTS, dim=1))
 
     def clamp(self, posture: Tensor) -> Tensor:
         """Move ``posture`` (N, 4) into the region that can be held: the one feasibility rule for commands.

@@ -179,7 +179,6 @@ def generate(path: Path = PATH) -> None:
     roll_limit, pitch_limits = command_limits(safe)
     fill_unsound(positions, sound)
     fill_unsound(torques, sound)
-    shifts = np.array([solver.shift_jacobian(joints) for joints in positions.reshape(-1, positions.shape[-1])])
     np.savez_compressed(
         path,
         height=HEIGHT.astype(np.float32),
@@ -188,7 +187,6 @@ def generate(path: Path = PATH) -> None:
         yaw=YAW.astype(np.float32),
         positions=positions.astype(np.float32),
         torques=torques.astype(np.float32),
-        shifts=shifts.reshape(*SHAPE, *shifts.shape[1:]).astype(np.float32),
         sound=sound,
         roll_limit=roll_limit.astype(np.float32),
         pitch_limits=pitch_limits.astype(np.float32),

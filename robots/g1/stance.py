@@ -185,22 +185,6 @@ class StanceSolver:
         forces = np.linalg.lstsq(jacobian[:, :6].T, gravity[:6], rcond=None)[0]
         return (gravity - jacobian.T @ forces)[6:][LOWER_JOINTS]
 
-    def shift_jacobian(self, joints: np.ndarray) -> np.ndarray:
-        """Change of the leg joints (12, 2) [rad/m] that moves the pelvis along x and y.
-
-        Feet, and the attitude of everything above the hips, stay where ``joints`` (15,) put them.
-        """
-        model, data = self.model, self.data
-        unknowns, posture = self.place(joints)
-        pin.computeJointJacobians(model, data, self.configuration(posture[0], unknowns))
-        pin.updateFramePlacements(model, data)
-        halves = []
-        for leg, foot in enumerate(self._feet):
-            columns = slice(6 + 6 * leg, 12 + 6 * leg)
-            jacobian = pin.getFrameJacobian(model, data, foot, pin.LOCAL_WORLD_ALIGNED)[:, columns]
-            halves.append(np.linalg.solve(jacobian, -np.eye(6)[:, :2]))
-        return np.vstack(halves)
-
     def _foot_errors(self) -> list[pin.SE3]:
         return [t.actInv(self.data.oMf[foot]) for foot, t in zip(self._feet, self._foot_targets, strict=True)]
 

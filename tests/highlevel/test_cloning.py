@@ -18,6 +18,7 @@ from highlevel.environment import CommandEnvironment, StepResult
 from highlevel.policy import PlannerNetwork, policy_arguments
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.measures import Measurement
+from robots.errors import PilotError
 from tasks.lift_box.config import LiftBoxConfig
 from tasks.lift_box.episode import draw
 
@@ -78,7 +79,7 @@ def test_demonstrations_survive_a_round_trip_and_damage_is_reported(tmp_path: Pa
         5,
     )
     path = tmp_path / "demonstrations.npz"
-    with pytest.raises(FileNotFoundError, match="does not exist"):
+    with pytest.raises(PilotError, match="does not exist"):
         Demonstrations.load(path)
     demonstrations.save(path)
     loaded = Demonstrations.load(path)

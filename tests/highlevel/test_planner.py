@@ -21,6 +21,7 @@ from highlevel.registration import DEFAULT_CONTROLLER, find_controller
 from highlevel.task import load_task
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.controller import content_hash
+from robots.errors import PilotError
 
 Make = Callable[..., CommandEnvironment]
 
@@ -127,5 +128,5 @@ def test_the_shipped_planner_finds_its_controller_and_fits_its_task() -> None:
 def test_controllers_are_found_by_folder_name_and_identity(tmp_path: Path) -> None:
     assert find_controller(tmp_path) == tmp_path
     assert find_controller().name == DEFAULT_CONTROLLER
-    with pytest.raises(FileNotFoundError, match="0123456789abcdef is not among"):
+    with pytest.raises(PilotError, match="0123456789abcdef is not among"):
         find_controller(identity="0123456789abcdef")

@@ -10,7 +10,7 @@ from lowlevel.networks import NetworkConfig, ObservationSizes
 from lowlevel.ppo import PPO, PPOConfig
 from robots.g1.mirror import Mirror
 
-SIZES = ObservationSizes(frame=10, history_length=5, elevation_map=121, privileged=12, action=4)
+SIZES = ObservationSizes(frame=10, history_length=5, elevation_map=121, privileged=133, action=4)
 NETWORKS = NetworkConfig(
     history_hidden=(32,),
     latent=8,
@@ -27,7 +27,7 @@ NETWORKS = NetworkConfig(
     prototypes=16,
 )
 _FRAME = Mirror(np.array([1, 0, 3, 2, 4, 5, 6, 7, 8, 9]), np.array([1, 1, -1, -1, -1, 1, -1, 1, 1, 1.0]))
-_PRIVILEGED = Mirror(np.arange(12), np.array([1, -1, 1] + [1] * 9, dtype=float))
+_PRIVILEGED = Mirror(np.arange(133), np.array([1, -1, 1] + [1] * 130, dtype=float))
 MIRRORS = {
     "history": _FRAME.repeated(6),
     "elevation_map": Mirror(np.arange(121).reshape(11, 11)[:, ::-1].reshape(-1), np.ones(121)),

@@ -1,7 +1,6 @@
 """The command space and its sampling (paper III-B-5)."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -9,15 +8,17 @@ import torch
 from lowlevel.commands import (
     ARMS,
     HEIGHT,
+    KINDS,
+    PROTOCOL,
     STANDING_SPEED,
     TORSO,
     VELOCITY,
-    CommandMixture,
-    CommandRange,
     CommandSampler,
     CommandSpace,
+    Mixture,
     command_space,
     is_walking,
+    shares,
 )
 from robots.g1.model import build_spec, joint_limits
 
@@ -28,9 +29,12 @@ def space() -> CommandSpace:
     return command_space(limits[:, 0].tolist(), limits[:, 1].tolist())
 
 
-def draw(space: CommandSpace, open_range: CommandRange, count: int = 4000) -> tuple[torch.Tensor, torch.Tensor]:
-    sampler = CommandSampler(space, CommandMixture(), "cpu")
-    return sampler.sample(count, open_range, torch.Generator().manual_seed(0))
+def draw(
+    space: CommandSpace, mixture: Mixture = PROTOCOL, opening: float = 1.0, count: int = 4000
+) -> tuple[torch.Tensor, torch.Tensor]:
+    sampler, generator = CommandSampler(space), torch.Generator().manual_seed(0)
+    kinds = sampler.draw_kinds(count, shares(mixture), generator)
+    return sampler.sample(kinds, torch.full((len(KINDS),), opening), generator)
 
 
 def test_has_a_name_unit_and_ordered_bounds_for_each_of_21_numbers(space: CommandSpace) -> None:
@@ -39,7 +43,7 @@ def test_has_a_name_unit_and_ordered_bounds_for_each_of_21_numbers(space: Comman
 
 
 def test_samples_stay_inside_the_bounds_and_fill_them(space: CommandSpace) -> None:
-    command, _ = draw(space, CommandRange())
+    command, _ = draw(space)
     lower, upper = space.bounds()
     assert (command >= lower - 1e-6).all() and (command <= upper + 1e-6).all()
     span = command.amax(0) - command.amin(0)
@@ -47,36 +51,37 @@ def test_samples_stay_inside_the_bounds_and_fill_them(space: CommandSpace) -> No
 
 
 def test_shares_of_the_mixture(space: CommandSpace) -> None:
-    command, flag = draw(space, CommandRange())
+    command, flag = draw(space)
     walks = is_walking(command)
     assert flag.mean().item() == pytest.approx(0.8, abs=0.03)
     assert (walks & (flag[:, 0] == 0)).float().mean().item() == pytest.approx(0.2, abs=0.03)
     assert (~walks).float().mean().item() == pytest.approx(0.4, abs=0.04)
 
 
-def test_slow_commands_are_slower_by_their_scale(space: CommandSpace) -> None:
-    walking = CommandMixture(walk_and_work=1.0, stand_and_work=0.0)
-
-    def speeds(mixture: CommandMixture) -> torch.Tensor:
-        sampler = CommandSampler(space, mixture)
-        return sampler.sample(4000, CommandRange(), torch.Generator().manual_seed(0))[0][:, VELOCITY].abs()
-
-    some, none = speeds(replace(walking, slow=0.5, slow_scale=0.2)), speeds(walking)
-    fast = [(speed[:, 0] > 0.2 * 1.2).float().mean().item() for speed in (some, none)]
-    assert fast[0] == pytest.approx(0.5 * fast[1], abs=0.03)
-    assert some.mean().item() == pytest.approx((0.5 + 0.5 * 0.2) * none.mean().item(), rel=0.05)
+def test_steering_is_left_out_as_often_as_stated(space: CommandSpace) -> None:
+    command, _ = draw(space, (("steer", 1.0),))
+    still = (command[:, 1:3] == 0.0).float().mean(dim=0)
+    assert still.tolist() == pytest.approx([0.5, 0.5], abs=0.04)
 
 
-def test_the_stand_share_stands_in_the_neutral_posture(space: CommandSpace) -> None:
-    sampler = CommandSampler(space, CommandMixture(walk_and_work=0.3, stand_and_work=0.3, stand=0.3))
-    command, flag = sampler.sample(4000, CommandRange(), torch.Generator().manual_seed(0))
-    neutral = (command == space.neutral()).all(dim=1)
-    assert neutral.float().mean().item() == pytest.approx(0.3, abs=0.03)
-    assert not flag[neutral].any()
+def test_every_kind_stays_in_its_box(space: CommandSpace) -> None:
+    for name, kind in KINDS.items():
+        command, flag = draw(space, ((name, 1.0),))
+        boxes = torch.tensor([*kind.velocity, kind.height, *kind.torso])
+        assert (command[:, :7] >= boxes[:, 0] - 1e-6).all() and (command[:, :7] <= boxes[:, 1] + 1e-6).all(), name
+        assert (flag == float(kind.tracks)).all()
+        assert torch.equal(command[:, ARMS], space.neutral()[ARMS].expand(4000, -1)) is not kind.arms
+
+
+def test_unknown_kinds_and_wrong_shares_are_refused() -> None:
+    with pytest.raises(ValueError, match="unknown kind of command 'moonwalk'"):
+        shares((("moonwalk", 1.0),))
+    with pytest.raises(ValueError, match=r"add up to 0\.500"):
+        shares((("walk", 0.5),))
 
 
 def test_walking_commands_keep_to_the_walking_posture(space: CommandSpace) -> None:
-    command, flag = draw(space, CommandRange())
+    command, flag = draw(space)
     walking = command[is_walking(command)]
     assert walking[:, HEIGHT].min() >= 0.55
     assert walking[:, TORSO].abs().max(dim=0).values.tolist() == pytest.approx([0.2, 0.5, 0.5], abs=0.01)
@@ -85,15 +90,15 @@ def test_walking_commands_keep_to_the_walking_posture(space: CommandSpace) -> No
 
 
 def test_slow_commands_become_exact_stops(space: CommandSpace) -> None:
-    command, _ = draw(space, CommandRange())
+    command, _ = draw(space)
     speed = command[:, VELOCITY].norm(dim=-1)
     assert ((speed == 0) | (speed >= STANDING_SPEED)).all()
 
 
-@pytest.mark.parametrize("openness", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("openness", [0.1, 0.5, 1.0])
 def test_arm_radius_follows_equation_two(space: CommandSpace, openness: float) -> None:
     """The mean of U(0, r) with r from Equation 2, against a numerical integral of the closed form."""
-    command, flag = draw(space, CommandRange(arms=openness), count=20000)
+    command, flag = draw(space, (("stand_and_work", 0.8), ("walk", 0.2)), openness, count=20000)
     arms = command[flag[:, 0] == 1][:, ARMS]
     lower, upper = (bound[ARMS] for bound in space.bounds())
     away = arms - space.neutral()[ARMS]
@@ -105,5 +110,5 @@ def test_arm_radius_follows_equation_two(space: CommandSpace, openness: float) -
 
 
 def test_closed_ranges_give_the_neutral_posture(space: CommandSpace) -> None:
-    command, _ = draw(space, CommandRange(velocity=0.0, height=0.0, torso=0.0, arms=0.0))
+    command, _ = draw(space, opening=0.0)
     assert torch.equal(command[:, : ARMS.start], space.neutral()[: ARMS.start].expand(len(command), -1))

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from lowlevel.control_step import MEMORY_NAMES, Memory
+from lowlevel.control_step import ControlStep
 from lowlevel.controller import (
     CONFIG_FILE,
     GOLDEN_FILE,
@@ -25,7 +26,7 @@ from lowlevel.controller import (
 from lowlevel.environment import EnvironmentConfig
 from lowlevel.export import export_controller
 from lowlevel.golden import replay
-from lowlevel.onnx_step import INPUTS, OUTPUTS
+from lowlevel.onnx_step import FIRST_MEMORY, INPUTS
 from lowlevel.trainer import Trainer, TrainingConfig
 
 SHIPPED = sorted((Path(__file__).parents[2] / "checkpoints" / "lowlevel").glob("*/"))
@@ -47,16 +48,14 @@ def golden_steps(folder: Path) -> list[dict[str, torch.Tensor]]:
     return [{name: torch.tensor(value) for name, value in step.items()} for step in golden["steps"]]
 
 
-@pytest.fixture(params=["exported", *SHIPPED], ids=lambda path: Path(path).name)
-def any_folder(request: pytest.FixtureRequest, folder: Path) -> Path:
-    return folder if request.param == "exported" else request.param
-
-
-@pytest.mark.parametrize("runtime", ["torch", "onnx"])
-def test_golden_vectors_replay_through_both_runtimes(any_folder: Path, runtime: Literal["torch", "onnx"]) -> None:
-    controller = Controller.load(any_folder, runtime=runtime)
+@pytest.mark.parametrize(
+    ("name", "runtime"), [("exported", "torch"), *((name, "onnx") for name in ("exported", *SHIPPED))]
+)
+def test_golden_vectors_replay(folder: Path, name: str | Path, runtime: Literal["torch", "onnx"]) -> None:
+    path = folder if name == "exported" else Path(name)
+    controller = Controller.load(path, runtime=runtime)
     controller.reset(4)
-    for step in golden_steps(any_folder):
+    for step in golden_steps(path):
         assert torch.allclose(replay(controller, step), step["targets"], atol=1e-5)
         assert torch.allclose(controller.last_action, step["action"], atol=1e-4)
 
@@ -64,15 +63,35 @@ def test_golden_vectors_replay_through_both_runtimes(any_folder: Path, runtime: 
 def test_onnx_file_needs_nothing_of_this_package(folder: Path) -> None:
     """A port feeds measurements and what came out last, by name, for any number of robots."""
     session = onnxruntime.InferenceSession(folder / ONNX_FILE)
-    steps = golden_steps(folder)
-    config = Controller.load(folder).config
-    fresh = Memory.fresh(4, config.command_space, config.nominal.settling_time).tensors
-    memory = {name: value.numpy() for name, value in zip(MEMORY_NAMES, fresh, strict=True)}
-    for step in steps:
-        measured = {name: value.numpy() for name, value in step.items() if name in INPUTS and name not in memory}
-        outputs = dict(zip(OUTPUTS, session.run(OUTPUTS, measured | memory), strict=True))
+    first = json.loads(session.get_modelmeta().custom_metadata_map[FIRST_MEMORY])
+    assert len(first) <= 4
+    memory = {name: np.repeat(np.array([value], dtype=np.float32), 4, axis=0) for name, value in first.items()}
+    names = [output.name for output in session.get_outputs()]
+    for step in golden_steps(folder):
+        measured = {name: value.numpy() for name, value in step.items() if name in INPUTS}
+        outputs = dict(zip(names, session.run(names, measured | memory), strict=True))
         np.testing.assert_allclose(outputs["targets"], step["targets"], atol=1e-5)
         memory = {name: outputs[f"next_{name}"] for name in memory}
+
+
+def test_a_controller_without_weights_runs_in_onnx_runtime_alone(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    (copy / WEIGHTS_FILE).unlink()
+    description = json.loads((copy / CONFIG_FILE).read_text())
+    del description["policy"]
+    (copy / CONFIG_FILE).write_text(json.dumps(description))
+    Controller.load(copy)
+    with pytest.raises(ControllerError, match="describes no policy for torch: use the runtime 'onnx'"):
+        Controller.load(copy, runtime="torch")
+
+
+def test_an_onnx_file_that_hides_its_first_memory_is_refused(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    model = onnx.load(copy / ONNX_FILE)
+    del model.metadata_props[:]
+    onnx.save(model, copy / ONNX_FILE)
+    with pytest.raises(ControllerError, match="does not say what its first memory is"):
+        Controller.load(copy)
 
 
 def test_unknown_runtimes_are_refused(folder: Path) -> None:
@@ -91,8 +110,8 @@ def test_missing_or_truncated_onnx_files_are_refused(folder: Path, tmp_path: Pat
     else:
         (copy / ONNX_FILE).write_bytes(content[:keep])
     with pytest.raises(ControllerError, match=ONNX_FILE):
-        Controller.load(copy, runtime="onnx")
-    Controller.load(copy)
+        Controller.load(copy)
+    Controller.load(copy, runtime="torch")
 
 
 def test_resetting_one_robot_forgets_only_that_robot(folder: Path) -> None:
@@ -113,12 +132,13 @@ def test_resetting_one_robot_forgets_only_that_robot(folder: Path) -> None:
 
 
 def test_acting_leaves_no_gradient_and_no_changed_weight(folder: Path) -> None:
-    controller = Controller.load(folder)
-    before = {name: tensor.clone() for name, tensor in controller.actor.state_dict().items()}
+    controller = Controller.load(folder, runtime="torch")
+    assert isinstance(controller.step, ControlStep)
+    before = {name: tensor.clone() for name, tensor in controller.step.actor.state_dict().items()}
     controller.reset(4)
     targets = replay(controller, golden_steps(folder)[0])
     assert not targets.requires_grad
-    assert all(torch.equal(tensor, before[name]) for name, tensor in controller.actor.state_dict().items())
+    assert all(torch.equal(tensor, before[name]) for name, tensor in controller.step.actor.state_dict().items())
 
 
 def test_wrong_number_of_robots_is_refused(folder: Path) -> None:
@@ -142,7 +162,7 @@ def copy(folder: Path, tmp_path: Path) -> Path:
 
 def refused(folder: Path) -> str:
     with pytest.raises(ControllerError) as error:
-        Controller.load(folder)
+        Controller.load(folder, runtime="torch")
     message = str(error.value)
     assert "\n" not in message
     return message
@@ -169,11 +189,11 @@ def test_weights_that_are_not_finite_are_refused_by_name(copy: Path) -> None:
     assert "'head.first.weight'" in refused(copy)
 
 
-def test_a_controller_that_is_not_finite_is_not_saved(folder: Path, tmp_path: Path) -> None:
-    controller = Controller.load(folder)
-    controller.actor.head.output_weight.data[0] = float("inf")
+def test_a_controller_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
+    trainer = Trainer(TrainingConfig(environment=EnvironmentConfig(num_robots=6, num_threads=1)), tmp_path)
+    trainer.ppo.actor.head.output_weight.data[0] = float("inf")
     with pytest.raises(ControllerError, match=r"'head\.output_weight' is not finite"):
-        controller.save(tmp_path / "broken")
+        export_controller(trainer, tmp_path / "broken")
     assert not (tmp_path / "broken").exists()
 
 

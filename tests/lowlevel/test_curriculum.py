@@ -1,42 +1,48 @@
-"""The curriculum opens ranges in the paper's order, and only when tracking and survival allow it."""
+"""Kinds of command open when they are tracked, and are drawn by what they lack."""
 
-from dataclasses import asdict
+import pytest
+import torch
 
-from lowlevel.commands import CommandRange
-from lowlevel.curriculum import STAGES, Curriculum, CurriculumConfig
+from lowlevel.commands import KINDS, shares
+from lowlevel.curriculum import QUALITY_TERMS, Curriculum, CurriculumConfig
 
-GOOD = {stage.reward: 1.0 for stage in STAGES}
+NAMES = list(KINDS)
 
 
-def test_nothing_opens_while_robots_fall() -> None:
+def see(curriculum: Curriculum, quality: dict[str, float], fall_rate: float = 0.0) -> None:
+    """One update after steps of the kinds in ``quality`` alone."""
+    for name, value in quality.items():
+        kind = torch.full((1000,), NAMES.index(name))
+        fallen = torch.arange(1000) < 1000 * fall_rate
+        curriculum.observe(kind, {term: torch.full((1000,), value) for term in QUALITY_TERMS}, fallen)
+    curriculum.update()
+
+
+def test_a_kind_opens_only_when_it_is_tracked_and_its_robots_stay_up() -> None:
+    config = CurriculumConfig()
+    for quality, fall_rate, opens in ((0.9, 0.0, True), (0.3, 0.0, False), (0.9, 0.02, False)):
+        curriculum = Curriculum(config)
+        for _ in range(400):
+            see(curriculum, {"walk": quality}, fall_rate)
+        opening = dict(zip(NAMES, curriculum.opening.tolist(), strict=True))
+        assert opening["walk"] == pytest.approx(1.0 if opens else config.start)
+        assert opening["squat"] == pytest.approx(config.start)  # nobody has tried
+
+
+def test_what_is_tracked_badly_is_drawn_more_often_down_to_a_floor() -> None:
     curriculum = Curriculum(CurriculumConfig())
-    curriculum.update(GOOD, survival=0.1)
-    assert curriculum.open_range == CurriculumConfig().start
-
-
-def test_stages_open_in_order_until_everything_is_open() -> None:
-    curriculum = Curriculum(CurriculumConfig())
-    opened: list[str] = []
-    for _ in range(1500):
-        before = asdict(curriculum.open_range)
-        curriculum.update(GOOD, survival=1.0)
-        opened += [k for k, v in asdict(curriculum.open_range).items() if v > before[k] and k not in opened]
-    assert opened == [stage.name for stage in STAGES]
-    assert curriculum.open_range == CommandRange()
-
-
-def test_a_stage_waits_for_its_own_tracking() -> None:
-    curriculum = Curriculum(CurriculumConfig())
-    for _ in range(1500):
-        curriculum.update(GOOD | {"base_height": 0.0}, survival=1.0)
-    assert curriculum.open_range.velocity == 1.0
-    assert curriculum.open_range.height == CurriculumConfig().start.height
-    assert curriculum.open_range.torso == CurriculumConfig().start.torso
+    mixture = shares((("walk", 0.25), ("stand", 0.25), ("squat", 0.5)))
+    for _ in range(100):
+        see(curriculum, {"walk": 0.2, "stand": 0.9, "squat": 0.6})
+    chance = dict(zip(NAMES, curriculum.probabilities(mixture).tolist(), strict=True))
+    assert sum(chance.values()) == pytest.approx(1.0)
+    assert chance["walk"] > 0.25 > chance["stand"] >= 0.25 / 2.0 / 2.0
+    assert chance["forward"] == 0.0
 
 
 def test_state_round_trip() -> None:
     curriculum, other = Curriculum(CurriculumConfig()), Curriculum(CurriculumConfig())
     for _ in range(10):
-        curriculum.update(GOOD, survival=1.0)
+        see(curriculum, {"walk": 0.9})
     other.load_state_dict(curriculum.state_dict())
-    assert other.open_range == curriculum.open_range
+    assert other.figures(torch.ones(len(KINDS))) == curriculum.figures(torch.ones(len(KINDS)))

@@ -12,7 +12,7 @@ from lowlevel import distributed
 from lowlevel.ppo import PPO
 
 ROBOTS = 8
-SETTINGS = {"symmetry": "none", "minibatches": 1, "epochs": 3, "gamma": 0.9, "actor_learning_rate": 1e-3}
+SETTINGS = {"mirror_loss_weight": 0.0, "minibatches": 1, "epochs": 3, "gamma": 0.9, "actor_learning_rate": 1e-3}
 
 
 def _fill(ppo: PPO, robots: slice, seed: int) -> dict[str, torch.Tensor]:

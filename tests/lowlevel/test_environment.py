@@ -1,16 +1,15 @@
 """The environment: finite, deterministic, honest about time limits, mirrored, and equal to the frozen controller."""
 
-import math
 from dataclasses import fields, replace
 
 import mujoco
 import pytest
 import torch
 
-from lowlevel.commands import HEIGHT, CommandRange
+from lowlevel.commands import HEIGHT, KINDS
 from lowlevel.controller import Controller, Proprioception
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
-from lowlevel.export import freeze
+from lowlevel.export import export_controller
 from lowlevel.measures import TRACKING_FIGURES, measure
 from lowlevel.observation import (
     FRAME,
@@ -24,6 +23,7 @@ from lowlevel.observation import (
 from lowlevel.ppo import PPOConfig
 from lowlevel.randomization import RandomizationConfig
 from lowlevel.rewards import REWARD_TERMS, RewardWeights
+from lowlevel.stages import Stage
 from lowlevel.terrain import TerrainConfig
 from lowlevel.trainer import Trainer, TrainingConfig
 
@@ -31,6 +31,7 @@ SMALL = EnvironmentConfig(num_robots=6, num_threads=1)
 QUIET = replace(
     SMALL,
     start_in_posture=0.0,
+    start_moving=0.0,
     noise=NoiseConfig(0.0, 0.0, 0.0, 0.0, 0.0),
     randomization=RandomizationConfig.for_evaluation(),
 )
@@ -101,10 +102,8 @@ def test_control_period_is_checked() -> None:
 
 def test_zero_action_stands_for_a_second_from_any_height_where_feet_do_not_slip() -> None:
     grip = replace(RandomizationConfig.for_evaluation(), friction=(1.0, 1.0))
-    still = replace(QUIET.nominal, stepping_threshold=math.inf)  # no robot may save itself by stepping
-    config = replace(QUIET, num_robots=16, start_in_posture=1.0, randomization=grip, nominal=still)
+    config = replace(QUIET, num_robots=16, start_in_posture=1.0, randomization=grip, mixture=(("squat", 1.0),))
     environment = PilotEnvironment(config, seed=2)
-    environment.open_range = CommandRange(velocity=0.0, height=1.0, torso=0.0, arms=0.0)
     environment.reset()
     results = [environment.step(torch.zeros(16, 29)) for _ in range(50)]
     assert not torch.stack([result.terminated for result in results]).any()
@@ -113,7 +112,8 @@ def test_zero_action_stands_for_a_second_from_any_height_where_feet_do_not_slip(
 
 
 def test_friction_of_the_feet_is_the_one_that_was_drawn() -> None:
-    environment = PilotEnvironment(replace(QUIET, randomization=replace(QUIET.randomization, friction=(0.4, 0.5))))
+    slippery = replace(QUIET.randomization, friction=(0.4, 0.5))
+    environment = PilotEnvironment(replace(QUIET, randomization=slippery, mixture=(("stand", 1.0),)))
     environment.reset()
     for _ in range(10):  # until the feet have landed
         environment.step(torch.zeros(6, 29))
@@ -123,6 +123,41 @@ def test_friction_of_the_feet_is_the_one_that_was_drawn() -> None:
         drawn = environment.randomizer.state.friction[robot].item()
         assert data.ncon > 0
         assert [contact.friction[0] for contact in data.contact] == pytest.approx([drawn] * data.ncon)
+
+
+def test_targets_reach_the_motors_as_late_as_drawn() -> None:
+    environment = PilotEnvironment(SMALL)
+    environment.reset()
+    environment.randomizer.state.delay = torch.tensor([0, 1, 2, 0, 1, 2])
+    sent = [torch.full((6, 29), float(number)) for number in range(4)]
+    arrived = [environment.randomizer.delayed(target)[:, 0].tolist() for target in sent]
+    assert arrived[2:] == [[2.0, 1.0, 0.0, 2.0, 1.0, 0.0], [3.0, 2.0, 1.0, 3.0, 2.0, 1.0]]
+
+
+def test_waist_motors_are_as_strong_as_drawn() -> None:
+    environment = PilotEnvironment(replace(SMALL, randomization=RandomizationConfig(waist_effort=(35.0, 36.0))))
+    environment.reset()
+    model = environment.simulation.robot_model(3)
+    limits = {
+        name: model.actuator(f"{name}_joint").forcerange[1] for name in ("waist_pitch", "waist_roll", "left_knee")
+    }
+    assert 35.0 <= limits["waist_pitch"] <= 36.0 and 35.0 <= limits["waist_roll"] <= 36.0
+    assert limits["left_knee"] == 139.0
+
+
+def test_arms_that_do_not_act_follow_the_command_alone() -> None:
+    environment = PilotEnvironment(replace(QUIET, arms_act=False))
+    environment.reset()
+    environment.step(torch.ones(6, 29))
+    assert (environment.buffers.action[:, 15:] == 0.0).all() and (environment.buffers.action[:, :15] == 1.0).all()
+
+
+def test_a_share_of_the_episodes_starts_at_the_told_velocity() -> None:
+    config = replace(QUIET, num_robots=64, mixture=(("walk", 1.0),), start_moving=1.0)
+    environment = PilotEnvironment(config)
+    environment.reset()
+    measured = measure(environment.simulation.read(), environment.terrain)
+    torch.testing.assert_close(measured.linear_velocity[:, :2], environment.buffers.command[:, :2], atol=1e-4, rtol=0.0)
 
 
 def test_falls_terminate_and_time_limits_truncate() -> None:
@@ -204,12 +239,13 @@ def test_every_reward_weight_has_a_term_and_every_term_a_weight() -> None:
 
 def test_frozen_controller_repeats_the_training_policy(tmp_path) -> None:
     """Controller.act on noise-free measurements gives the targets that the environment applies."""
-    config = TrainingConfig(environment=QUIET, ppo=PPOConfig(steps_per_update=8, minibatches=2))
+    stage = Stage(arms_act=True, randomization=QUIET.randomization)
+    config = TrainingConfig(environment=QUIET, ppo=PPOConfig(steps_per_update=8, minibatches=2), stages=(stage,))
     trainer = Trainer(config, tmp_path)
     generator = torch.Generator().manual_seed(0)
     weight = trainer.ppo.actor.head.output_weight
     weight.data += 0.02 * torch.randn(weight.shape, generator=generator)
-    freeze(trainer).save(tmp_path / "controller")
+    export_controller(trainer, tmp_path / "controller")
     controller = Controller.load(tmp_path / "controller")
     controller.reset(6)
     environment = trainer.environment
@@ -228,17 +264,16 @@ def test_frozen_controller_repeats_the_training_policy(tmp_path) -> None:
             environment.buffers.command,
             environment.buffers.flag,
         )
-        reference = environment.buffers.nominal.reference.clone()
-        action = trainer.ppo.deterministic(observation)
-        result = environment.step(action, trainer.ppo.estimated_velocity)
+        reference = environment.buffers.reference.command.clone()
+        result = environment.step(trainer.ppo.deterministic(observation))
         observation = result.observation
-        assert torch.allclose(targets, environment.buffers.previous_target, atol=2e-5)
+        assert torch.allclose(targets, environment.randomizer.state.past_targets[:, 0], atol=2e-5)
         assert torch.allclose(controller.reference, reference, atol=1e-5)
 
 
 def test_tracking_figures_vanish_for_a_robot_that_does_as_told() -> None:
     environment = PilotEnvironment(QUIET)
-    environment.open_range = CommandRange(velocity=0.0, height=0.0, torso=0.0, arms=0.0)
+    environment.opening = torch.zeros(len(KINDS))
     environment.reset()
     measured = measure(environment.simulation.read(), environment.terrain)
     command = environment.buffers.command.clone()

@@ -107,11 +107,11 @@ def test_commands_are_hidden_from_the_next_state_encoder() -> None:
 
 
 def test_estimator_learns_only_in_its_epochs_and_from_its_own_loss() -> None:
-    ppo = make_ppo(symmetry="none")
+    ppo = make_ppo(mirror_loss_weight=0.0)
     for estimating in (True, False):
         ppo.storage.flat("history").normal_()
-        samples, mirrored = ppo._samples(torch.arange(64), estimating)
-        losses = ppo.learner.losses(samples, mirrored, None, torch.full((4,), 0.5), estimating)
+        samples = ppo._samples(torch.arange(64), estimating)
+        losses = ppo.learner.losses(samples, None, torch.full((4,), 0.5), estimating)
         assert ("estimator" in losses) == estimating
         before = [p.clone() for p in ppo.learner.groups["estimator"]]
         ppo.learner.step(losses)

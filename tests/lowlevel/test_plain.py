@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 
 from lowlevel.plain import from_plain
-from lowlevel.provenance import read_training_config
 from lowlevel.trainer import TrainingConfig
 
 
@@ -21,39 +19,33 @@ def test_a_configuration_comes_back_from_json_as_it_was() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda nominal: nominal | {"colour": 1}, "NominalConfig has no field 'colour'"),
-        (lambda nominal: {k: v for k, v in nominal.items() if k != "lean"}, "NominalConfig lacks its field 'lean'"),
+        (lambda prior: prior | {"colour": 1}, "GaitPriorConfig has no field 'colour'"),
+        (lambda prior: {k: v for k, v in prior.items() if k != "lift"}, "GaitPriorConfig lacks its field 'lift'"),
     ],
 )
 def test_unknown_and_absent_fields_are_refused(change, message: str) -> None:
     plain = asdict(TrainingConfig())
-    plain["environment"]["nominal"] = change(plain["environment"]["nominal"])
+    plain["environment"]["prior"] = change(plain["environment"]["prior"])
     with pytest.raises(KeyError, match=message):
         from_plain(TrainingConfig, plain)
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "message"),
+    ("part", "field", "value", "message"),
     [
-        ("stepping_time", "long", "stepping_time must be of type float, not 'long'"),
-        ("stepping_time", True, "stepping_time must be of type float, not True"),
-        ("gait_clock", 1, "gait_clock must be of type bool, not 1"),
-        ("torso_rate", 1.0, r"torso_rate must be a list, not 1\.0"),
-        ("lean", [0.1], "lean must have 2 entries, not 1"),
-        ("lean", [0.1, None], "lean must be of type float, not None"),
-        ("kind", "gallop", "kind must be one of default, pose, march, not 'gallop'"),
+        ("network", "latent", "wide", "latent must be of type int, not 'wide'"),
+        ("network", "latent", True, "latent must be of type int, not True"),
+        ("network", "vision", 1, "vision must be of type bool, not 1"),
+        ("network", "history_hidden", 1.0, r"history_hidden must be a list, not 1\.0"),
+        ("network", "expert_hidden", [1], "expert_hidden must have 2 entries, not 1"),
+        ("network", "expert_hidden", [1, None], "expert_hidden must be of type int, not None"),
     ],
 )
-def test_values_of_another_type_are_refused(field: str, value: object, message: str) -> None:
+def test_values_of_another_type_are_refused(part: str, field: str, value: object, message: str) -> None:
     plain = asdict(TrainingConfig())
-    plain["environment"]["nominal"][field] = value
+    plain[part][field] = value
     with pytest.raises((TypeError, ValueError), match=message):
         from_plain(TrainingConfig, plain)
     plain["environment"] = 3
     with pytest.raises(TypeError, match="environment must hold the fields of EnvironmentConfig, not 3"):
         from_plain(TrainingConfig, plain)
-
-
-def test_the_shipped_learning_state_is_of_this_version() -> None:
-    run = Path(__file__).resolve().parents[2] / "checkpoints" / "training" / "pilot-g1-simple"
-    assert read_training_config(run).environment.terrain.tiles == ("flat", "irregular")

@@ -7,7 +7,7 @@ import torch
 
 from lowlevel.checks import NonFiniteError
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
-from lowlevel.measures import Measurement, has_fallen, measure, stumbles, torso_error
+from lowlevel.measures import Measurement, has_fallen, is_lost, measure, stumbles, torso_error
 from lowlevel.rewards import REWARD_TERMS, RewardWeights, Transition, compute_rewards
 from lowlevel.rotations import from_roll_pitch_yaw
 
@@ -27,7 +27,8 @@ def standing() -> Transition:
         previous_action=zeros,
         nominal_target=zeros,
         phase=torch.zeros(4),
-        walking=torch.zeros(4),
+        walking=torch.zeros(4, dtype=torch.bool),
+        gait_frequency=1.25,
         foot_air_time=torch.zeros(4, 2),
         foot_contact_time=torch.zeros(4, 2),
         fallen=torch.zeros(4, dtype=torch.bool),
@@ -72,7 +73,7 @@ def test_contact_terms(standing: Transition) -> None:
     velocity[:, 0, 0], velocity[:, 1, 1] = 0.3, 0.4
     feet = moved(standing, foot_contact=contact, foot_velocity=velocity)
     assert term("no_fly", feet) == [1.0, 0.0, 0.0, 1.0]
-    marching = replace(feet, walking=torch.ones(4))
+    marching = replace(feet, walking=torch.ones(4, dtype=torch.bool))
     assert term("no_fly", marching) == [0.0, 1.0, 0.0, 0.0]
     assert term("feet_slippage", feet) == pytest.approx([0.7, 0.3, 0.0, 0.7])
 
@@ -86,6 +87,38 @@ def test_air_time_counts_the_shorter_role_up_to_its_limit(standing: Transition) 
     )
     assert term("feet_air_time", walking) == pytest.approx([0.1, 0.2, 0.4, 0.2])
     assert term("feet_air_time", replace(walking, command=standing.command)) == [0.0] * 4
+
+
+def test_gait_terms_follow_the_clock(standing: Transition) -> None:
+    """At a quarter of the cycle the left foot is at mid-swing and the right one bears the robot."""
+    walking = replace(standing, phase=torch.full((4,), torch.pi / 2), walking=torch.ones(4, dtype=torch.bool))
+    clearance = torch.tensor([[0.09, 0.0], [0.04, 0.0], [0.0, 0.0], [0.0, 0.09]])
+    contact = torch.tensor([[False, True], [True, True], [False, False], [True, False]])
+    feet = moved(walking, foot_clearance=clearance, foot_contact=contact)
+    assert term("contact_schedule", feet) == [1.0, 0.5, 0.5, 0.0]
+    assert term("swing_height", feet) == pytest.approx([1.0, 0.5, 0.0, 0.0])
+    errors = [0.0, 0.05**2, 0.09**2, 2 * 0.09**2]
+    assert term("foot_phase", feet) == pytest.approx([2.718281828 ** (-error / 0.003) for error in errors])
+    still = replace(feet, walking=torch.zeros(4, dtype=torch.bool))
+    assert term("swing_height", still) == [0.0] * 4
+
+
+def test_feet_are_to_be_where_the_told_velocity_needs_them(standing: Transition) -> None:
+    """At 0.5 m/s and 1.25 Hz the robot goes 0.4 m per cycle, so that landing feet are 0.2 m apart along the heading."""
+    command = standing.command.index_fill(1, torch.tensor([0]), 0.5)
+    walking = torch.ones(4, dtype=torch.bool)
+    landing = replace(standing, command=command, phase=torch.full((4,), torch.pi), walking=walking)
+    right = torch.tensor([[1.0, 1.0, 0.0]]).repeat(4, 1)
+    left = right + torch.tensor([[0.2, 0.24, 0.0], [0.1, 0.24, 0.0], [0.2, 0.34, 0.0], [-0.2, 0.24, 0.0]])
+    placed = moved(landing, foot_position=torch.stack([left, right], dim=1), heading=torch.zeros(4))
+    squares = [0.0, 0.01, 0.01, 0.16]
+    assert term("foot_placement", placed) == pytest.approx([2.718281828 ** (-s / 0.02) for s in squares], rel=1e-4)
+
+
+def test_torques_near_the_motors_limits_cost(standing: Transition) -> None:
+    torque = torch.zeros(4, 29)
+    torque[1, 3], torque[2, 3], torque[3, 14] = 0.8 * 139.0, -139.0, 45.0
+    assert term("torque_limits", moved(standing, joint_torque=torque)) == pytest.approx([0.0, 0.0, 0.2, 0.1], abs=1e-5)
 
 
 def test_stumbling_compares_sideways_with_vertical_force(standing: Transition) -> None:
@@ -103,11 +136,19 @@ def test_stumbling_compares_sideways_with_vertical_force(standing: Transition) -
 
 
 def test_a_step_of_the_command_is_not_a_fall_but_a_tilt_is(standing: Transition) -> None:
-    assert not has_fallen(standing.measured, standing.command).any()
+    assert not is_lost(standing.measured, standing.command).any()
     tilted = moved(standing, torso_orientation=from_roll_pitch_yaw(torch.tensor([[1.0, 0.0, 0.0]]).repeat(4, 1)))
-    assert has_fallen(tilted.measured, standing.command).all()
+    assert is_lost(tilted.measured, standing.command).all()
     sunk = moved(standing, base_height=torch.full((4,), 0.45))
-    assert has_fallen(sunk.measured, standing.command).all()
+    assert is_lost(sunk.measured, standing.command).all()
+
+
+def test_a_fall_is_a_part_of_the_body_on_the_ground(standing: Transition) -> None:
+    assert not has_fallen(standing.measured).any()
+    clearance = standing.measured.body_clearance.clone()
+    assert clearance[0].tolist() == pytest.approx([0.76, 1.0, 1.2, 0.4, 0.4, 0.9, 0.9], abs=0.15)
+    clearance[1, 3], clearance[2, 0], clearance[3, 2] = 0.05, 0.11, 0.09  # a knee, the pelvis, nearly the head
+    assert has_fallen(moved(standing, body_clearance=clearance).measured).tolist() == [False, True, True, False]
 
 
 def test_total_is_the_weighted_sum_per_second(standing: Transition) -> None:

@@ -44,15 +44,13 @@ def test_lambda_one_gives_discounted_returns() -> None:
     torch.testing.assert_close((advantages + values)[0], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_storage_keeps_steps_in_order_and_images_apart() -> None:
-    storage = RolloutStorage(2, 3, {"x": (2,), "reward": ()}, torch.device("cpu"), images=True)
+def test_storage_keeps_steps_in_order() -> None:
+    storage = RolloutStorage(2, 3, {"x": (2,), "reward": ()}, torch.device("cpu"))
     for step in range(2):
         storage.write({"x": torch.full((3, 2), float(step)), "reward": torch.arange(3.0) + 10 * step})
         storage.finish_step(torch.tensor([False, True, False]), torch.zeros(3, dtype=torch.bool))
     assert storage.full
     assert storage.flat("reward").tolist() == [0, 1, 2, 10, 11, 12]
-    storage.images("reward").copy_(-storage.flat("reward"))
-    assert storage.samples("reward").tolist() == [0, 1, 2, 10, 11, 12, 0, -1, -2, -10, -11, -12]
     assert storage.data["reward"].tolist() == [[0, 1, 2], [10, 11, 12]]
     assert storage.terminated.tolist() == [[False, True, False]] * 2
 

@@ -50,6 +50,7 @@ def _measurement(heading: float, palms: Tensor) -> Measurement:
         foot_force=torch.zeros(1, 2, 3),
         palm_position=palms,
         palm_quaternion=facing[:, None].expand(-1, 2, -1),
+        body_points=torch.ones(1, 7, 3),
     )
     return Measurement(
         robot=robot,
@@ -61,6 +62,7 @@ def _measurement(heading: float, palms: Tensor) -> Measurement:
         torso_orientation=from_roll_pitch_yaw(torch.tensor([[0.1, 0.6, -0.2]])),
         foot_clearance=torch.zeros(1, 2),
         foot_contact=torch.ones(1, 2, dtype=torch.bool),
+        body_clearance=torch.ones(1, 7),
     )
 
 

@@ -1,0 +1,55 @@
+"""Stages of a training run as data: what each one changes, and what it waits for.
+
+A policy that learns everything at once learns nothing: over the whole command space the gradient is nearly all noise.
+Each stage draws few kinds of command, with as much exploration noise as what it teaches can bear.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from lowlevel.commands import PROTOCOL, Mixture
+from lowlevel.environment import EnvironmentConfig
+from lowlevel.randomization import RandomizationConfig
+from lowlevel.rewards import RewardWeights
+from lowlevel.terrain import TerrainConfig
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One part of a run. It ends when its figure is reached, after ``least_steps`` and before ``most_steps``."""
+
+    name: str = "train"
+    waits_for: str = ""
+    """Logged figure that ends the stage; "" for none."""
+    above: float = 0.0
+    """Value that the figure, averaged over some 10 updates, must exceed."""
+    least_steps: int = 500_000
+    """Environment steps that the stage takes at least: the first robots have not had the time to fall."""
+    most_steps: int = 1_000_000_000
+    """Environment steps after which the next stage begins all the same."""
+    std: tuple[float, float] = (0.05, 0.3)
+    """Bounds of the exploration noise [action units]."""
+    gait_prior: float = 0.0
+    """Weight of the gait prior. When a stage without prior follows one with it, the policy absorbs the prior first."""
+    rollout_doublings: int = 0
+    """Rollouts are 2 to this power times as long as at first: the better the policy, the more samples it takes to see
+    what would improve it."""
+    arms_act: bool = False
+    """Whether the policy corrects the arms: fourteen more noisy outputs that share every update's KL divergence."""
+    mixture: Mixture = PROTOCOL
+    terrain: TerrainConfig = field(default_factory=TerrainConfig)
+    rewards: RewardWeights = field(default_factory=RewardWeights)
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+
+    def environment(self, base: EnvironmentConfig) -> EnvironmentConfig:
+        """The task in this stage."""
+        return replace(
+            base,
+            gait_prior=self.gait_prior,
+            arms_act=self.arms_act,
+            mixture=self.mixture,
+            terrain=self.terrain,
+            rewards=self.rewards,
+            randomization=self.randomization,
+        )

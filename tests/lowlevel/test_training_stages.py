@@ -1,0 +1,106 @@
+"""Stages follow one another by what was measured, and a gait prior is absorbed on the way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from lowlevel.absorption import AbsorptionConfig, absorb_prior
+from lowlevel.commands import KINDS
+from lowlevel.environment import EnvironmentConfig, PilotEnvironment
+from lowlevel.network_config import NetworkConfig
+from lowlevel.ppo import PPOConfig
+from lowlevel.presets import PRESETS
+from lowlevel.randomization import RandomizationConfig
+from lowlevel.rewards import RewardWeights
+from lowlevel.stages import Stage
+from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig
+
+QUICK = AbsorptionConfig(rounds=2, steps=4, mixed_rounds=1, gradient_steps=2, minibatch=16)
+FIRST = Stage("first", "reward/alive", above=0.1, least_steps=0, std=(0.2, 0.3), gait_prior=1.0)
+SECOND = Stage("second", std=(0.05, 0.1), rollout_doublings=1, arms_act=True, mixture=(("walk", 1.0),))
+
+
+def tiny(*stages: Stage) -> TrainingConfig:
+    return TrainingConfig(
+        environment=EnvironmentConfig(num_robots=8, num_threads=1),
+        network=NetworkConfig(vision=False, history_hidden=(16,), expert_hidden=(16, 8), critic_hidden=(16,)),
+        ppo=PPOConfig(steps_per_update=8, minibatches=2),
+        absorption=QUICK,
+        stages=tuple(replace(stage, rewards=RewardWeights(alive=1.0)) for stage in stages),
+    )
+
+
+def test_the_next_stage_begins_when_its_figure_is_reached(tmp_path: Path) -> None:
+    trainer = Trainer(replace(tiny(FIRST, SECOND), total_steps=64 * 4), tmp_path)
+    assert trainer.environment.config.gait_prior == 1.0
+    trainer.train()
+    assert trainer.stage.name == "second"
+    environment = trainer.environment
+    assert environment.config.gait_prior == 0.0 and environment.config.arms_act
+    assert set(environment.buffers.kind.tolist()) == {list(KINDS).index("walk")}
+    assert trainer.ppo.storage.steps == 16
+    assert float(trainer.ppo.actor.log_std.exp().max()) <= 0.1 + 1e-6
+
+
+def test_a_stage_that_never_gets_there_ends_by_its_steps(tmp_path: Path) -> None:
+    hopeless = replace(FIRST, above=2.0, most_steps=128)
+    trainer = Trainer(replace(tiny(hopeless, SECOND), total_steps=64 * 2), tmp_path)
+    trainer.train()
+    assert trainer.stage.name == "second"
+    trainer = Trainer(replace(tiny(replace(hopeless, most_steps=129), SECOND), total_steps=64 * 2), tmp_path)
+    trainer.train()
+    assert trainer.stage.name == "first"
+
+
+def test_a_resumed_run_goes_on_in_its_stage(tmp_path: Path) -> None:
+    config = replace(tiny(FIRST, SECOND), total_steps=64 * 4)
+    trainer = Trainer(config, tmp_path)
+    trainer.train()
+    resumed = Trainer(config, tmp_path)
+    resumed.load(tmp_path / STATE_FILE)
+    assert resumed.stage.name == "second" and resumed.stage_begin == trainer.stage_begin > 0
+    assert resumed.ppo.storage.steps == 16
+    first, second = trainer.iterate(), resumed.iterate()
+    assert {k: v for k, v in first.items() if "speed" not in k} == {k: v for k, v in second.items() if "speed" not in k}
+
+
+def test_absorption_teaches_the_policy_what_the_prior_did(tmp_path: Path) -> None:
+    """Walking on the spot by the prior alone: after absorption the policy does the same without it."""
+    walking = Stage(
+        "walk", gait_prior=1.0, mixture=(("walk", 1.0),), randomization=RandomizationConfig.for_evaluation()
+    )
+    config = replace(tiny(walking), environment=EnvironmentConfig(num_robots=32, num_threads=1))
+    trainer = Trainer(config, tmp_path)
+    alone = PilotEnvironment(replace(trainer.environment.config, gait_prior=0.0), seed=1)
+    progress: list[float] = []
+    settings = AbsorptionConfig(rounds=12, mixed_rounds=6, minibatch=256, learning_rate=3e-3)
+    observation = absorb_prior(
+        trainer.ppo, alone, 1.0, settings, lambda text: progress.append(float(text.split(": ")[1].split(" nat")[0]))
+    )
+    assert progress[-1] < 0.3 * progress[0]
+    state = alone.buffers.reference
+    wanted = alone.prior(state) / alone.action_scale
+    action = trainer.ppo.deterministic(observation)
+    assert torch.isfinite(action).all()
+    assert (action - wanted)[:, :15].square().mean() < 0.5 * wanted[:, :15].square().mean()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_stages_of_presets_wait_for_figures_that_are_logged(name: str, tmp_path: Path) -> None:
+    config = PRESETS[name]
+    for stage in config.stages:
+        small = replace(
+            config,
+            stages=(stage,),
+            environment=replace(config.environment, num_robots=4, num_threads=1),
+            ppo=replace(config.ppo, steps_per_update=4, minibatches=1),
+        )
+        trainer = Trainer(small, tmp_path)
+        trainer.observation = trainer.environment.reset()
+        figures = trainer.iterate()
+        assert not stage.waits_for or math.isfinite(figures[stage.waits_for])
