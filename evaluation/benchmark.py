@@ -28,7 +28,6 @@ from evaluation.reports import (
     format_figure,
     markdown_table,
     metrics,
-    run_command,
     write_metrics,
     write_results,
 )
@@ -43,10 +42,13 @@ from evaluation.speed import (
 )
 from evaluation.statistics import Figure, mean_figure
 from highlevel.task import load_task
+from lowlevel.command_line import command_line
 from lowlevel.controller import Controller, content_hash
-from lowlevel.export import freeze
+from lowlevel.export import export_controller
 from lowlevel.presets import PRESETS
 from lowlevel.progress import ProgressReport
+from lowlevel.trainer import Trainer, TrainingConfig
+from robots.errors import PilotError
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Arguments:
 
     output: Path = Path("runs/evaluation/benchmark")
     """Folder for report.md and metrics.json; files of the same name there are replaced."""
-    robots: int = PRESETS["flat"].environment.num_robots
+    robots: int = PRESETS["simple"].environment.num_robots
     """Robots of the batched simulation."""
     planner_robots: int = 64
     """Robots of the batched planner environment."""
@@ -74,13 +76,14 @@ class Arguments:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``benchmark``."""
     parsed = tyro.cli(Arguments, args=arguments)
-    run_command("benchmark", lambda: _run(parsed))
+    with command_line("benchmark", "interrupted, nothing was written"):
+        _run(parsed)
 
 
 def _run(arguments: Arguments) -> None:
     for name in ("robots", "planner_robots", "cores", "seconds", "ticks", "updates"):
         if getattr(arguments, name) <= 0:
-            raise ValueError(f"--{name.replace('_', '-')} must be positive")
+            raise PilotError(f"--{name.replace('_', '-')} must be positive")
     load_task(arguments.task)
     check_output(arguments.output)
     print(f"measuring on {arguments.cores} cores", flush=True)
@@ -106,19 +109,19 @@ def measure_everything(arguments: Arguments, folder: Path, progress: Progress) -
     def next_is(name: str) -> None:
         progress.update(task, description=name, advance=1)
 
-    flat = PRESETS["flat"]
-    config = replace(
-        flat, environment=replace(flat.environment, num_robots=arguments.robots, num_threads=arguments.cores)
-    )
+    config = _training("simple", arguments)
     torch.set_num_threads(arguments.cores)
-    figures, trainer = measure_training(config, folder, arguments.updates)
+    trainer = Trainer(config, folder)
+    figures = measure_training(trainer, arguments.updates, "training")
+    perceptive = Trainer(_training("vision", arguments), folder)
+    figures |= measure_training(perceptive, arguments.updates, "perceptive_training")
     next_is("environment")
     figures |= measure_environment(trainer.environment, arguments.seconds)
     next_is("plain environments")
     rates = plain_rates(config, arguments.cores, arguments.seconds)
     figures["plain_subproc_steps_per_second"] = mean_figure(rates, "1/s")
     next_is("controller")
-    freeze(trainer).save(folder / "controller")
+    export_controller(trainer, folder / "controller")
     torch.set_num_threads(1)
     figures |= measure_latency(folder / "controller", arguments.ticks)
     next_is("planner")
@@ -134,8 +137,18 @@ def measure_everything(arguments: Arguments, folder: Path, progress: Progress) -
     return figures, content_hash(folder / "controller")
 
 
+def _training(preset: str, arguments: Arguments) -> TrainingConfig:
+    """The training of a preset with the benchmark's robots and cores, in its first stage without a gait prior."""
+    config = PRESETS[preset]
+    environment = replace(config.environment, num_robots=arguments.robots, num_threads=arguments.cores)
+    first = next(stage for stage in config.stages if stage.gait_prior == 0.0)
+    return replace(config, environment=environment, stages=(first,))
+
+
 RATIOS: dict[str, tuple[str, str]] = {
     "environment_over_plain_subproc": ("environment_steps_per_second", "plain_subproc_steps_per_second"),
+    "training_over_physics": ("training_steps_per_second", "physics_steps_per_second"),
+    "perceptive_training_over_physics": ("perceptive_training_steps_per_second", "physics_steps_per_second"),
     "planner_over_subproc": ("planner_decisions_per_second", "planner_subproc_decisions_per_second"),
 }
 
@@ -175,8 +188,12 @@ _ROWS = {
     "environment_python_share": "share of an environment step outside physics",
     "plain_subproc_steps_per_second": "baseline: plain MuJoCo environments in SubprocVecEnv",
     "environment_over_plain_subproc": "environment over baseline",
-    "training_steps_per_second": "training end to end, full network",
-    "training_update_share": "share of training spent in updates",
+    "training_steps_per_second": "training end to end, blind network",
+    "training_update_share": "share of it spent in updates",
+    "training_over_physics": "training, blind network, over physics alone",
+    "perceptive_training_steps_per_second": "training end to end, perceptive network",
+    "perceptive_training_update_share": "share of it spent in updates",
+    "perceptive_training_over_physics": "training, perceptive network, over physics alone",
     "controller_tick_onnx_p50": "controller tick, one core, ONNX Runtime, median",
     "controller_tick_onnx_p99": "controller tick, one core, ONNX Runtime, 99th percentile",
     "controller_tick_torch_p50": "controller tick, one core, torch, median",
@@ -189,7 +206,7 @@ _ROWS = {
 
 def report_text(figures: dict[str, Figure], machine: dict[str, Any], arguments: Arguments) -> str:
     """``report.md``."""
-    rows = []
+    rows: list[list[str]] = []
     for name, meaning in _ROWS.items():
         figure = figures[name]
         digits = 0 if (figure.value or 0.0) >= 100.0 else 2

@@ -12,8 +12,9 @@ import numpy as np
 import tyro
 
 from evaluation.plots import plot_overlays
-from evaluation.reports import run_command
+from lowlevel.command_line import command_line
 from lowlevel.training_log import LOG_FILE
+from robots.errors import PilotError
 
 PANELS = {
     "episode/steps_between_falls": "steps between falls",
@@ -44,18 +45,18 @@ def read_curves(run: Path, window: int) -> tuple[np.ndarray, dict[str, np.ndarra
     """Environment steps (T,) of a run's log and the figures of :data:`PANELS` (T,), averaged over ``window`` updates.
 
     Raises:
-        ValueError: if the folder holds no log of a low-level run, or one shorter than the window.
+        PilotError: if the folder holds no log of a low-level run, or one shorter than the window.
     """
     path = run / LOG_FILE
     if not path.is_file():
-        raise ValueError(f"{path} is missing: give folders of train-lowlevel's runs")
+        raise PilotError(f"{path} is missing: give folders of train-lowlevel's runs")
     try:
         entries = [json.loads(line) for line in path.read_text().splitlines()]
     except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+        raise PilotError(f"{path} is damaged: {error}") from error
     entries = [entry for entry in entries if all(name in entry for name in PANELS)]
     if len(entries) < window:
-        raise ValueError(f"{path} has {len(entries)} updates, fewer than the window of {window}")
+        raise PilotError(f"{path} has {len(entries)} updates, fewer than the window of {window}")
     kernel = np.full(window, 1.0 / window)
     steps = np.convolve([entry["steps"] for entry in entries], kernel, mode="valid")
     curves = {name: np.convolve([entry[name] for entry in entries], kernel, mode="valid") for name in PANELS}
@@ -64,14 +65,14 @@ def read_curves(run: Path, window: int) -> tuple[np.ndarray, dict[str, np.ndarra
 
 def _run(arguments: Arguments) -> None:
     if not arguments.runs:
-        raise ValueError("give the folders of at least one run")
+        raise PilotError("give the folders of at least one run")
     if arguments.window < 1:
-        raise ValueError("--window must be at least 1")
+        raise PilotError("--window must be at least 1")
     if not arguments.output.suffix:
-        raise ValueError(f"{arguments.output} names no picture: give a file such as comparison.png")
+        raise PilotError(f"{arguments.output} names no picture: give a file such as comparison.png")
     curves = {run.name: read_curves(run, arguments.window) for run in arguments.runs}
     if len(curves) < len(set(arguments.runs)):
-        raise ValueError("two of the folders have the same name, which curves are told apart by: rename one")
+        raise PilotError("two of the folders have the same name, which curves are told apart by: rename one")
     panels = {
         title: {name: (steps / 1e6, figures[key]) for name, (steps, figures) in curves.items()}
         for key, title in PANELS.items()
@@ -84,7 +85,8 @@ def _run(arguments: Arguments) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``python -m evaluation.compare_runs``."""
     parsed = tyro.cli(Arguments, args=arguments)
-    run_command("evaluation.compare_runs", lambda: _run(parsed))
+    with command_line("evaluation.compare_runs", "interrupted, nothing was written"):
+        _run(parsed)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ from evaluation.reports import (
     REPORT_FILE,
     check_output,
     markdown_table,
-    run_command,
     write_json,
     write_results,
 )
@@ -30,9 +29,11 @@ from highlevel.action import interpolate
 from highlevel.environment import CommandEnvironment, PhysicsConfig, StepResult
 from highlevel.planner import planner_hash
 from highlevel.task import Decision, Outcome, Task, load_task, rows
+from lowlevel.command_line import command_line
 from lowlevel.controller import content_hash
 from lowlevel.measures import Measurement
 from lowlevel.progress import ProgressReport
+from robots.errors import PilotError
 
 RECORDING_FILE, OUTCOME_FILE, STRIP_FILE = "episode.rrd", "outcome.json", "stages.png"
 
@@ -96,12 +97,13 @@ class WatchedTask:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``run-demo``."""
     parsed = tyro.cli(Arguments, args=arguments)
-    run_command("run-demo", lambda: _run(parsed))
+    with command_line("run-demo", "interrupted, nothing was written"):
+        _run(parsed)
 
 
 def _run(arguments: Arguments) -> None:
     if arguments.episode < 0 or arguments.threads < 1:
-        raise ValueError("--episode must not be negative and --threads must be at least 1")
+        raise PilotError("--episode must not be negative and --threads must be at least 1")
     load_task(arguments.task)
     check_output(arguments.output)
     folder = controller_for(arguments.planner, arguments.controller)
@@ -168,11 +170,10 @@ def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tupl
 
     twin = VisualTwin(add_surroundings)
     twin.adopt_sizes(environment.simulation, 0)
-    network = environment.controller.config.network
     result: StepResult | None = None
     with Recorder(recording, arguments.live) as recorder, ProgressReport() as progress:
         bar = progress.add_task("episode", total=environment.max_decisions)
-        film = EpisodeRecording(recorder, twin, network.experts if network.mixture else 1)
+        film = EpisodeRecording(recorder, twin, environment.controller.experts)
         while result is None or not bool(result.done[0]):
             result = environment.step(policy.act(observation), auto_reset=False)
             observation = result.observation

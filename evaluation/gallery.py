@@ -13,13 +13,15 @@ import tyro
 
 from evaluation.harness import Arena, constant
 from evaluation.pictures import Painter, film_strip, following_camera, save_picture
-from evaluation.reports import check_output, run_command
+from evaluation.reports import check_output
 from evaluation.skills import HOLDING_ARMS
 from evaluation.visuals import VisualTwin
 from highlevel.registration import find_controller
+from lowlevel.command_line import command_line
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.controller import Controller
 from lowlevel.terrain import TerrainConfig
+from robots.errors import PilotError
 
 DURATION = 5.0
 """How long a command lasts until the picture is taken [s]."""
@@ -69,14 +71,15 @@ class Arguments:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``python -m evaluation.gallery``."""
     parsed = tyro.cli(Arguments, args=arguments)
-    run_command("evaluation.gallery", lambda: _run(parsed))
+    with command_line("evaluation.gallery", "interrupted, nothing was written"):
+        _run(parsed)
 
 
 def _run(arguments: Arguments) -> None:
     torch.set_num_threads(1)
     folder = find_controller(arguments.controller)
     if arguments.output.is_dir():
-        raise ValueError(f"--output is the picture, but {arguments.output} is a folder: name a file in it")
+        raise PilotError(f"--output is the picture, but {arguments.output} is a folder: name a file in it")
     check_output(arguments.output.parent)
     pixels = draw(Controller.load(folder), arguments.seed)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
@@ -89,15 +92,16 @@ def draw(controller: Controller, seed: int) -> np.ndarray:
 
     Raises:
         NoOpenGLError: if this machine cannot render.
-        ValueError: if the robot falls in one of them.
+        PilotError: if the robot falls in one of them.
     """
     arena = Arena(controller, TerrainConfig(tiles=("irregular",)), batch=len(POSES))
     neutral = controller.config.command_space.neutral()
     episodes = [constant(seed, DURATION, _command(pose, neutral), flag=1.0) for pose in POSES]
     for moment in arena.run(episodes):
-        if moment.fell.any():
-            pose = POSES[int(torch.nonzero(moment.fell)[0, 0])]
-            raise ValueError(f"the robot falls when told {pose.name!r}: there is nothing to draw")
+        down = moment.fell | moment.failed
+        if down.any():
+            pose = POSES[int(torch.nonzero(down)[0, 0])]
+            raise PilotError(f"the robot falls when told {pose.name!r}: there is nothing to draw")
     twin = VisualTwin(arena.terrain.add_to)
     pictures = []
     with Painter(twin.model) as painter:

@@ -2,7 +2,8 @@
 
 An episode is fixed by its seed and its command schedule alone. Friction, start and observation noise come
 from the episode's own generator, and every batch has the same number of rows, so that an episode's outcome
-depends neither on how many others are evaluated nor on which ones.
+depends neither on how many others are evaluated nor on which ones. Every command counts: a robot that falls lies
+there until its next command begins, and is stood up for it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from lowlevel.randomization import RandomizationConfig, Randomizer
 from lowlevel.rotations import from_roll_pitch_yaw
 from lowlevel.simulation import BatchSimulation
 from lowlevel.terrain import MAP_SIZE, Terrain, TerrainConfig
+from robots.errors import PilotError
 from robots.g1.constants import DEFAULT_POSITION, LOWER_JOINTS, NUM_JOINTS, joint_index
 from robots.g1.model import ModelOptions, build_spec
 
@@ -77,6 +79,8 @@ class Episode:
     """Index of the terrain tile to start on."""
     pushes: tuple[Push, ...] = ()
     load: HandLoad | None = None
+    stands_up: bool = True
+    """Whether a robot that has fallen is stood up for its next command."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +103,16 @@ class Moment:
     """The noisy elevation map that the controller saw (N, 121) [m]."""
     gate: Tensor
     """Expert activations (N, experts)."""
+    work: Tensor
+    """Of all motors in the step, both signs counted positive (N,) [J]."""
+    number: Tensor
+    """Which command of its episode is tracked (N,)."""
     active: Tensor
-    """Episodes that were running (N,)."""
+    """Robots that were up when the step began, in episodes that were running (N,)."""
     fell: Tensor
-    """Active episodes that fell in this step (N,)."""
+    """Active robots that fell in this step (N,)."""
+    failed: Tensor
+    """Active robots whose controller gave targets that are not finite (N,); they are out like those that fell."""
 
 
 def episode_seeds(seed: int, index: int) -> tuple[int, int]:
@@ -135,18 +145,20 @@ class Arena:
     Args:
         controller: on the CPU; its memory is reset by every batch.
         terrain: tiles to start on.
+        conditions: friction, latency, gains and torque limits; the protocol's by default.
         noise: observation noise.
         num_threads: physics threads.
         batch: robots simulated side by side (N).
 
     Raises:
-        ValueError: if the controller runs at another rate.
+        PilotError: if the controller runs at another rate.
     """
 
     def __init__(
         self,
         controller: Controller,
         terrain: TerrainConfig,
+        conditions: RandomizationConfig | None = None,
         noise: NoiseConfig = NoiseConfig(),  # noqa: B008 (frozen)
         num_threads: int = 2,
         batch: int = BATCH,
@@ -160,9 +172,9 @@ class Arena:
         self.period = self.simulation.control_period
         expected = controller.config.control_period
         if abs(self.period - expected) > 1e-9:
-            raise ValueError(f"the controller runs every {expected} s, the evaluation every {self.period} s")
-        randomization = RandomizationConfig.for_evaluation()
-        self._randomizer = Randomizer(randomization, self.simulation, torch.Generator())
+            raise PilotError(f"the controller runs every {expected} s, the evaluation every {self.period} s")
+        drawn = RandomizationConfig.for_evaluation() if conditions is None else conditions
+        self._randomizer = Randomizer(drawn, self.simulation, torch.Generator())
         self._proprioception_noise = noise.frame_amplitude()
         self._elevation_noise = noise.elevation
 
@@ -181,31 +193,47 @@ class Arena:
         rows = torch.arange(self.batch)
         lengths = torch.zeros(self.batch, dtype=torch.long)
         lengths[: len(episodes)] = torch.tensor([self._steps(episode.duration) for episode in episodes])
+        stands_up = torch.zeros(self.batch, dtype=torch.bool)
+        stands_up[: len(episodes)] = torch.tensor([episode.stands_up for episode in episodes])
         starts, commands, flags = self._schedules(episodes)
         pushes = self._pushes(episodes)
         load_begin, outward, downward = self._loads(episodes)
-        frame_noise, map_noise = self._start(episodes)
+        frame_noise, map_noise, starting = self._start(episodes)
         self.controller.reset(self.batch)
-        active = lengths > 0
+        up = torch.ones(self.batch, dtype=torch.bool)
         measured = measure(self.simulation.read(), self.terrain)
         elevation = torch.zeros(self.batch, MAP_SIZE)
         for step in range(int(lengths.max())):
             current = (starts <= step).sum(dim=1) - 1
+            rising = torch.nonzero(~up & stands_up & (starts[rows, current] == step) & (step < lengths))[:, 0]
+            if len(rising):
+                self._stand(rising, *(values[rising] for values in starting))
+                self.controller.reset(self.batch, rising)
+                up[rising] = True
+                measured = measure(self.simulation.read(), self.terrain)
+            active = up & (step < lengths)
+            waiting = stands_up & ((starts > step) & (starts < lengths[:, None])).any(dim=1) & (step < lengths)
+            if not (active | waiting).any():
+                return
             command, flag = commands[rows, current], flags[rows, current]
-            if step % MAP_REFRESH_STEPS == 0:
-                elevation = self.terrain.elevation_map(measured.robot.base_position, measured.heading)
-                elevation = elevation + map_noise[step // MAP_REFRESH_STEPS]
+            seeing = rows if step % MAP_REFRESH_STEPS == 0 else rising
+            if len(seeing):
+                ground = self.terrain.elevation_map(measured.robot.base_position, measured.heading)
+                elevation[seeing] = (ground + map_noise[step // MAP_REFRESH_STEPS])[seeing]
             proprioception = _proprioception(measured, frame_noise[step])
             targets = self.controller.act(proprioception, elevation, command, flag)
+            failed = active & ~torch.isfinite(targets).all(dim=1)
             if step in pushes:
                 self.simulation.push(pushes[step])
             bears = load_begin <= step
             if bears.any():
                 palms = measured.robot.palm_position
                 self.simulation.set_hand_force(hand_forces(palms, bears * outward, bears * downward))
-            self.simulation.step(targets)
+            moving = torch.nonzero(active & ~failed)[:, 0]
+            applied = self._randomizer.delayed(torch.nan_to_num(targets))
+            work = self.simulation.step_with_work(applied, moving)
             measured = measure(self.simulation.read(), self.terrain)
-            fallen = has_fallen(measured, self.controller.reference) | self.simulation.diverged()
+            fell = active & ~failed & (has_fallen(measured) | self.simulation.diverged())
             yield Moment(
                 step=step,
                 measured=measured,
@@ -213,14 +241,15 @@ class Arena:
                 command=command,
                 flag=flag,
                 since_change=(step + 1 - starts[rows, current]) * self.period,
-                elevation=elevation,
+                elevation=elevation.clone(),
                 gate=self.controller.gate,
+                work=work,
+                number=current,
                 active=active,
-                fell=active & fallen,
+                fell=fell,
+                failed=failed,
             )
-            active = active & ~fallen & (step + 1 < lengths)
-            if not active.any():
-                return
+            up = up & ~fell & ~failed
 
     # -- preparing a batch -----------------------------------------------------------------------------------
 
@@ -261,11 +290,12 @@ class Arena:
                 outward[row], downward[row] = episode.load.outward, episode.load.downward
         return begin, outward, downward
 
-    def _start(self, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor]:
+    def _start(self, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
         """Draw everything random and put all robots on their feet.
 
         Returns:
-            noise of the proprioception (steps, N, 64) and of the elevation map (refreshes, N, 121).
+            noise of the proprioception (steps, N, 64) and of the elevation map (refreshes, N, 121), and where and how
+            each robot stands: xy (N, 2) [m], heading (N,) [rad], deviation of its joints (N, 29) [rad].
         """
         steps = max(self._steps(episode.duration) for episode in episodes)
         refreshes = -(-steps // MAP_REFRESH_STEPS)
@@ -274,9 +304,10 @@ class Arena:
         place, joint_spread = torch.zeros(self.batch, 3), torch.zeros(self.batch, NUM_JOINTS)
         tiles = torch.zeros(self.batch, dtype=torch.long)
         for row, episode in enumerate(episodes):
-            generator = torch.Generator().manual_seed(episode.seed)
-            self._randomizer.generator = generator
-            self._randomizer.draw(torch.tensor([row]), hand_load_scale=0.0)
+            # Apart from each other, so that conditions that draw more leave place and noise as they are.
+            self._randomizer.generator = torch.Generator().manual_seed(episode.seed)
+            self._randomizer.draw(torch.tensor([row]))
+            generator = torch.Generator().manual_seed(episode.seed + 1)
             place[row] = _symmetric(generator, 3)
             joint_spread[row] = JOINT_SPREAD * _symmetric(generator, NUM_JOINTS)
             # Drawn step by step, so that the noise does not depend on how long the episode lasts.
@@ -286,24 +317,26 @@ class Arena:
                 frame_noise[when, row] = self._proprioception_noise * noise[: when.stop - when.start]
                 map_noise[refresh, row] = self._elevation_noise * _symmetric(generator, MAP_SIZE)
             tiles[row] = episode.tile
-        xy = self.terrain.tile_centers[tiles] + START_SPREAD * place[:, :2]
-        self._stand(xy, torch.pi * place[:, 2], joint_spread)
-        return frame_noise, map_noise
+        starting = self.terrain.tile_centers[tiles] + START_SPREAD * place[:, :2], torch.pi * place[:, 2], joint_spread
+        self._stand(torch.arange(self.batch), *starting)
+        return frame_noise, map_noise, starting
 
-    def _stand(self, xy: Tensor, heading: Tensor, joint_spread: Tensor) -> None:
-        """At rest in the nominal pose of the neutral command, torso upright, feet just above the ground."""
-        zeros = torch.zeros(self.batch)
-        neutral = self.controller.config.command_space.neutral().repeat(self.batch, 1)
-        joints = torch.tensor(DEFAULT_POSITION, dtype=torch.float32).repeat(self.batch, 1)
-        joints[:, LOWER_JOINTS] = self.controller.motion.pose.lookup(neutral[:, POSTURE])[0]
+    def _stand(self, ids: Tensor, xy: Tensor, heading: Tensor, joint_spread: Tensor) -> None:
+        """Put robots ``ids`` (n,) at rest in the nominal pose of the neutral command, feet just above the ground."""
+        count = len(ids)
+        zeros = torch.zeros(count)
+        neutral = self.controller.config.command_space.neutral().repeat(count, 1)
+        joints = torch.tensor(DEFAULT_POSITION, dtype=torch.float32).repeat(count, 1)
+        joints[:, LOWER_JOINTS] = self.controller.pose.lookup(neutral[:, POSTURE]).position
         pelvis_pitch = -joints[:, joint_index("waist_pitch_joint")]
         orientation = from_roll_pitch_yaw(torch.stack([zeros, pelvis_pitch, heading], -1))
         on_ground = torch.cat([xy, zeros[:, None]], -1)
         highest_ground = -self.terrain.elevation_map(on_ground, heading).amin(dim=1)
         height = highest_ground + neutral[:, HEIGHT] + 0.005
         position = torch.cat([xy, height[:, None]], -1)
-        self.simulation.reset(torch.arange(self.batch), position, orientation, joints + joint_spread)
-        self.simulation.forward()
+        self.simulation.reset(ids, position, orientation, joints + joint_spread)
+        self._randomizer.start(ids, joints)
+        self.simulation.forward(ids)
 
 
 def run_all(

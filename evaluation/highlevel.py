@@ -23,7 +23,6 @@ from evaluation.reports import (
     format_figure,
     markdown_table,
     metrics,
-    run_command,
     write_json,
     write_metrics,
     write_results,
@@ -33,8 +32,10 @@ from evaluation.sweeps import SweepResult, cells, report_lines, sweep_figures, s
 from highlevel.episodes import EpisodeRecord
 from highlevel.planner import planner_hash
 from highlevel.task import Task, load_task
+from lowlevel.command_line import command_line
 from lowlevel.controller import content_hash
 from lowlevel.progress import ProgressReport
+from robots.errors import PilotError
 
 EPISODES_FILE = "episodes.json"
 LIFT_STAGE = "lift"
@@ -95,13 +96,14 @@ class Evaluation:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``evaluate-highlevel``."""
     parsed = tyro.cli(Arguments, args=arguments)
-    run_command("evaluate-highlevel", lambda: _run(parsed))
+    with command_line("evaluate-highlevel", "interrupted, nothing was written"):
+        _run(parsed)
 
 
 def _run(arguments: Arguments) -> None:
     for name in ("episodes", "control_episodes", "sweep_episodes", "robots", "threads"):
         if getattr(arguments, name) < 1:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
+            raise PilotError(f"--{name.replace('_', '-')} must be at least 1")
     task = load_task(arguments.task)
     check_output(arguments.output)
     folder = controller_for(arguments.planner, arguments.controller)
@@ -118,7 +120,7 @@ def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
     began = time.monotonic()
     task = load_task(arguments.task)
     if arguments.sweeps and not task.sweeps:
-        raise ValueError(f"the task {task.name!r} has no sweeps: leave out --sweeps")
+        raise PilotError(f"the task {task.name!r} has no sweeps: leave out --sweeps")
     names = control_names(task) if arguments.controls else ()
     sweeps = task.sweeps if arguments.sweeps else ()
     grids = [list(cells(task, sweep)) for sweep in sweeps]
@@ -161,13 +163,13 @@ def control_names(task: Task) -> tuple[str, ...]:
     """Names of a task's negative controls: the values of ``config.control`` beside ``none``.
 
     Raises:
-        ValueError: if the task has no negative controls.
+        PilotError: if the task has no negative controls.
     """
     config: Any = getattr(task, "config", None)
     hint = get_type_hints(type(config)).get("control") if config is not None else None
     names = tuple(name for name in get_args(hint) if name != "none")
     if not names:
-        raise ValueError(f"the task {task.name!r} has no negative controls: leave out --controls")
+        raise PilotError(f"the task {task.name!r} has no negative controls: leave out --controls")
     return names
 
 

@@ -22,7 +22,6 @@ from evaluation.reports import (
     format_figure,
     markdown_table,
     metrics,
-    run_command,
     write_metrics,
     write_results,
 )
@@ -30,16 +29,21 @@ from evaluation.skills import EPISODES as SKILL_EPISODES
 from evaluation.skills import FLAT, SKILLS, run_skills, skill_episodes, skills_section
 from evaluation.statistics import Figure
 from evaluation.tracking import (
+    AVERAGING,
     COMMAND_INTERVAL,
     EPISODE_LENGTH,
+    FIGURES,
     GROUPS,
+    SUITES,
     TRANSIENT,
     WALK_EPISODES,
     WALK_SPEED,
     WALK_TIME,
-    TrackingResult,
+    CommandTable,
+    conditions_of,
     mode_episodes,
     motion_modes,
+    paired_differences,
     protocol_episodes,
     run_modes,
     run_tracking,
@@ -48,15 +52,18 @@ from evaluation.tracking import (
     tracking_figures,
     walking_episodes,
 )
+from lowlevel.command_line import command_line
 from lowlevel.controller import Controller, add_metrics, content_hash
 from lowlevel.measures import TRACKING_FIGURES
 from lowlevel.progress import ProgressReport
+from lowlevel.terrain import TerrainConfig
+from robots.errors import PilotError
 
-PAPER: dict[str, dict[str, float]] = {
-    "simple": dict(
-        zip(TRACKING_FIGURES, (0.145, 0.099, 0.010, 0.057, 0.053, 0.055, 0.206), strict=False),
-    ),
-}
+_BLIND = dict(zip(TRACKING_FIGURES, (0.145, 0.099, 0.010, 0.057, 0.053, 0.055, 0.206), strict=False))
+EPISODES_FILE = "episodes.csv"
+"""Every command of the protocol with its figures."""
+
+PAPER: dict[str, dict[str, float]] = dict.fromkeys(SUITES, _BLIND)
 """The paper's figures for each suite: on simple terrain those of its blind policy (Table II)."""
 
 
@@ -66,8 +73,14 @@ class Arguments:
 
     controller: Path
     """Controller folder."""
+    against: tuple[Path, ...] = ()
+    """Folders of controllers to compare with: same commands, same seeds, differences episode by episode."""
     suite: str = "simple"
-    """Terrain: simple (flat, ±2 cm irregularities)."""
+    """Terrain: simple (flat and slabs that differ by ±2 cm, half of the episodes each), flat, or slabs."""
+    condition: str = "nominal"
+    """What is other than in the protocol: late-20ms, late-40ms (latency of the targets), slippery (friction 0.4),
+    other-gains (every stiffness and damping off by up to 20 %), weak-motors (80 % of the torque limits), weak-waist
+    (35 N m at waist roll and pitch)."""
     episodes: int = 500
     """Episodes of 20 s."""
     seed: int = 0
@@ -93,11 +106,16 @@ class Evaluation:
     """Everything a report shows."""
 
     suite: str
+    condition: str
     seed: int
     controller: str
     """Content hash."""
     figures: dict[str, Figure]
-    tracking: TrackingResult
+    table: CommandTable
+    transient: np.ndarray
+    """Mean errors over the time since a command began (steps, figures)."""
+    differences: dict[str, dict[str, Figure]]
+    """Ours minus the other's, by content hash of the other controller and by figure."""
     modes: tuple[str, ...]
     activations: np.ndarray
     """(modes, experts)"""
@@ -111,24 +129,29 @@ class Evaluation:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``evaluate-lowlevel``."""
     parsed = tyro.cli(Arguments, args=arguments)
-    run_command("evaluate-lowlevel", lambda: _run(parsed))
+    with command_line("evaluate-lowlevel", "interrupted, nothing was written"):
+        _run(parsed)
 
 
 def _run(arguments: Arguments) -> None:
     for name in ("episodes", "walk_episodes", "robots", "threads"):
         if getattr(arguments, name) < 1:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
+            raise PilotError(f"--{name.replace('_', '-')} must be at least 1")
     if arguments.skill_episodes < 0:
-        raise ValueError("--skill-episodes must not be negative")
+        raise PilotError("--skill-episodes must not be negative")
     if not 0 <= arguments.record <= min(arguments.robots, arguments.episodes):
-        raise ValueError("--record must be between 0 and the number of episodes and of robots")
+        raise PilotError("--record must be between 0 and the number of episodes and of robots")
     suite_terrain(arguments.suite)
+    conditions_of(arguments.condition)
+    if arguments.write_metrics and arguments.condition != "nominal":
+        raise PilotError("--write-metrics is for figures under the nominal condition: leave one of the two out")
     check_output(arguments.output)
     controller = Controller.load(arguments.controller)
+    others = {content_hash(folder): Controller.load(folder) for folder in arguments.against}
     # Small matrix products only lose time to waking threads, and the physics wants the cores.
     torch.set_num_threads(1)
     print(f"evaluating {arguments.controller} on the {arguments.suite} suite", flush=True)
-    evaluation = evaluate(controller, content_hash(arguments.controller), arguments)
+    evaluation = evaluate(controller, content_hash(arguments.controller), arguments, others)
 
     def write(folder: Path) -> None:
         write_report(folder, evaluation)
@@ -145,39 +168,53 @@ def _run(arguments: Arguments) -> None:
     print(f"report: {arguments.output / REPORT_FILE}   figures: {arguments.output / METRICS_FILE}")
 
 
-def evaluate(controller: Controller, identity: str, arguments: Arguments) -> Evaluation:
-    """Run the protocol, the walking test, the motion modes and the skill tests."""
+def evaluate(
+    controller: Controller, identity: str, arguments: Arguments, others: Mapping[str, Controller]
+) -> Evaluation:
+    """Run the protocol, the walking test, the motion modes and the skill tests, and the protocol with ``others``."""
     began = time.monotonic()
     terrain = suite_terrain(arguments.suite)
     space, tiles, seed = controller.config.command_space, len(terrain.tiles), arguments.seed
-    arena = Arena(controller, terrain, num_threads=arguments.threads, batch=arguments.robots)
+    conditions = conditions_of(arguments.condition)
+
+    def arena_of(tested: Controller, tiles: TerrainConfig) -> Arena:
+        return Arena(tested, tiles, conditions, num_threads=arguments.threads, batch=arguments.robots)
+
+    arena = arena_of(controller, terrain)
     protocol = protocol_episodes(space, arguments.episodes, seed, tiles)
     walks = walking_episodes(space, arguments.walk_episodes, seed, tiles)
     modes = mode_episodes(space, seed)
     skills = {skill.name: skill_episodes(skill, space, arguments.skill_episodes, seed) for skill in SKILLS}
     with ProgressReport() as progress:
-        total = sum(batch_steps(arena, episodes) for episodes in (protocol, walks, modes, *skills.values()))
+        batches = (*[protocol] * (1 + len(others)), walks, modes, *skills.values())
+        total = sum(batch_steps(arena, episodes) for episodes in batches)
         task = progress.add_task("tracking", total=total)
 
         def advance(steps: int) -> None:
             progress.update(task, advance=steps)
 
-        tracking = run_tracking(arena, protocol, advance)
+        table, transient = run_tracking(arena, protocol, advance)
+        differences = {}
+        for name, other in others.items():
+            progress.update(task, description=f"tracking of {name}")
+            differences[name] = paired_differences(table, run_tracking(arena_of(other, terrain), protocol, advance)[0])
         progress.update(task, description="walking")
         walking = run_walking(arena, walks, advance)
         progress.update(task, description="experts")
         activations = run_modes(arena, modes, advance)
-        figures = tracking_figures(tracking, terrain.tiles) | walking
+        figures = tracking_figures(table, terrain.tiles) | walking
         if arguments.skill_episodes:
             progress.update(task, description="skills")
-            flat = Arena(controller, FLAT, num_threads=arguments.threads, batch=arguments.robots)
-            figures |= run_skills(flat, skills, advance)
+            figures |= run_skills(arena_of(controller, FLAT), skills, advance)
     return Evaluation(
         suite=arguments.suite,
+        condition=arguments.condition,
         seed=seed,
         controller=identity,
         figures=figures,
-        tracking=tracking,
+        table=table,
+        transient=transient,
+        differences=differences,
         modes=tuple(motion_modes(space)),
         activations=activations,
         tiles=terrain.tiles,
@@ -190,7 +227,8 @@ def _record(controller: Controller, arguments: Arguments, folder: Path) -> None:
     from evaluation.recording import record_episodes  # the viewer's library is large and seldom needed here
 
     terrain = suite_terrain(arguments.suite)
-    arena = Arena(controller, terrain, num_threads=arguments.threads, batch=arguments.robots)
+    conditions = conditions_of(arguments.condition)
+    arena = Arena(controller, terrain, conditions, num_threads=arguments.threads, batch=arguments.robots)
     space = controller.config.command_space
     episodes = protocol_episodes(space, arguments.record, arguments.seed, len(terrain.tiles))
     record_episodes(arena, episodes, folder)
@@ -203,17 +241,16 @@ def write_report(folder: Path, evaluation: Evaluation) -> None:
     """Write ``report.md``, plots and ``metrics.json`` into ``folder``."""
     figures, paper = evaluation.figures, PAPER[evaluation.suite]
     cases = {"all": "", "steady": "_steady", **{group: f"_{group}" for group in GROUPS}}
-    panels = {
-        name: {label: figures[name + suffix] for label, suffix in cases.items()}
-        for name in (*TRACKING_FIGURES, "fall_rate")
-    }
+    panels = {name: {label: figures[name + suffix] for label, suffix in cases.items()} for name in TRACKING_FIGURES}
+    panels["fall_rate"] = {label: figures["fall_rate" + suffix] for label, suffix in cases.items() if label != "steady"}
+    evaluation.table.write(folder / EPISODES_FILE, evaluation.tiles)
     plot_bars(folder / "tracking.png", panels, paper, columns=3)
-    steps = np.arange(1, len(evaluation.tracking.transient) + 1) * evaluation.period
+    steps = np.arange(1, len(evaluation.transient) + 1) * evaluation.period
     titles = [f"{name} [{unit}]" for name, (unit, _) in TRACKING_FIGURES.items()]
     plot_curves(
         folder / "transient.png",
         steps,
-        evaluation.tracking.transient,
+        evaluation.transient,
         titles,
         "time since the command changed [s]",
     )
@@ -231,7 +268,12 @@ def write_report(folder: Path, evaluation: Evaluation) -> None:
             evaluation.seed,
             evaluation.controller,
             suite=evaluation.suite,
+            condition=evaluation.condition,
             expert_activations=activations,
+            differences={
+                other: {name: asdict(figure) for name, figure in rows.items()}
+                for other, rows in evaluation.differences.items()
+            },
             seconds=round(evaluation.seconds, 1),
         ),
     )
@@ -250,16 +292,19 @@ def report_text(evaluation: Evaluation) -> str:
     figures = evaluation.figures
     survival, speed = figures["walk_half_mps_survival"], figures["walk_half_mps_speed"]
     energy, action_rate = figures["energy_per_metre"], figures["action_rate"]
-    episodes = len(evaluation.tracking.tiles)
+    episodes = figures["fall_rate"].n
     return "\n".join(
         [
             f"# Tracking on the {evaluation.suite} suite",
             "",
             f"Controller `{evaluation.controller}`, {episodes} episodes of {EPISODE_LENGTH:.0f} s with a new "
             f"command every {COMMAND_INTERVAL:.0f} s, seed {evaluation.seed}, terrain "
-            f"{', '.join(evaluation.tiles)}. Means over episodes with 95 % bootstrap intervals over episodes "
-            f"(Wilson intervals for shares). Steady figures leave out the first {TRANSIENT:.0f} s after a "
-            "change of command. A fallen episode counts in full at the error it had until its fall.",
+            f"{', '.join(evaluation.tiles)}, condition {evaluation.condition}. Means over episodes with 95 % bootstrap "
+            f"intervals over episodes (Wilson intervals for shares). Steady errors leave out the first {TRANSIENT:.0f} "
+            "s after a change of command. A command that ends in a fall counts in full at the error it had until then, "
+            "and the next one begins from standing. E_v_mean and E_omega_mean are the errors of velocities averaged "
+            f"over {AVERAGING:g} s: drift without the sway of the gait. E_arm is that of commands with I = 1. Every "
+            f"command by itself stands in `{EPISODES_FILE}`.",
             "",
             markdown_table(
                 ["figure", "unit", "ours", "ours, steady", "paper, blind"], _main_rows(figures, evaluation.suite)
@@ -270,6 +315,7 @@ def report_text(evaluation: Evaluation) -> str:
             "steps whose command asks for translation, by the way made good in the commanded direction. From one "
             f"control step to the next a joint's target moves by {format_figure(action_rate, 4)} rad on average.",
             "",
+            *_comparison(evaluation.differences),
             "## By kind of command",
             "",
             "Walk and work: full velocity range with moderate postures and moving arms. Stand and work: full "
@@ -278,7 +324,7 @@ def report_text(evaluation: Evaluation) -> str:
             _breakdown(figures, {group: f"_{group}" for group in GROUPS}),
             "Steady:",
             "",
-            _breakdown(figures, {group: f"_{group}_steady" for group in GROUPS}),
+            _breakdown(figures, {group: f"_{group}" for group in GROUPS}, "_steady"),
             "![transient](transient.png)",
             "",
             "## By terrain",
@@ -304,23 +350,42 @@ def report_text(evaluation: Evaluation) -> str:
 
 def _main_rows(figures: Mapping[str, Figure], suite: str) -> list[list[str]]:
     paper = PAPER[suite]
-    names = [*TRACKING_FIGURES, "fall_rate"]
-    return [
+    rows = [
         [
             name,
-            figures[name].unit,
+            unit,
             format_figure(figures[name]),
             format_figure(figures[f"{name}_steady"]),
             f"{paper[name]:.3f}" if name in paper else "–",
         ]
-        for name in names
+        for name, unit in FIGURES.items()
+    ]
+    rates = ("fall_rate", "fall_rate_command", "non_finite_rate")
+    return rows + [[name, "1", format_figure(figures[name]), "–", "–"] for name in rates]
+
+
+def _comparison(differences: Mapping[str, Mapping[str, Figure]]) -> list[str]:
+    """The section on other controllers, if there are any."""
+    if not differences:
+        return []
+    names = list(next(iter(differences.values())))
+    rows = [[name, *(format_figure(figures[name]) for figures in differences.values())] for name in names]
+    return [
+        "## Against other controllers",
+        "",
+        "Ours minus theirs, episode by episode with the same commands, starts, friction and noise; below zero we are "
+        "better. fell is the share of commands that end in a fall.",
+        "",
+        markdown_table(["figure", *(f"against `{name}`" for name in differences)], rows),
     ]
 
 
-def _breakdown(figures: Mapping[str, Figure], columns: Mapping[str, str]) -> str:
-    names = [*TRACKING_FIGURES, "fall_rate"]
-    rows = [[name, *(format_figure(figures[name + suffix]) for suffix in columns.values())] for name in names]
-    counts = ["episodes", *(str(figures[f"fall_rate{suffix}"].n) for suffix in columns.values())]
+def _breakdown(figures: Mapping[str, Figure], columns: Mapping[str, str], suffix: str = "") -> str:
+    rows = [[name, *(format_figure(figures[name + part + suffix]) for part in columns.values())] for name in FIGURES]
+    if not suffix:
+        rates = ("fall_rate", "fall_rate_command")
+        rows += [[name, *(format_figure(figures[name + part]) for part in columns.values())] for name in rates]
+    counts = ["episodes", *(str(figures[f"fall_rate{part}"].n) for part in columns.values())]
     return markdown_table(["figure", *(label.replace("_", " ") for label in columns)], [*rows, counts])
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from matplotlib.image import imsave
 
 from lowlevel.files import atomic_write
+from robots.errors import PilotError
 from robots.g1.constants import PELVIS_BODY
 
 PLATFORMS = ("egl", "osmesa")
@@ -24,7 +25,7 @@ PLATFORMS = ("egl", "osmesa")
 _PROBE_SECONDS = 60.0
 
 
-class NoOpenGLError(OSError):
+class NoOpenGLError(PilotError):
     """Pictures cannot be rendered on this machine; the message says what to install."""
 
 

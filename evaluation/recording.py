@@ -27,6 +27,7 @@ from lowlevel.measures import Measurement
 from lowlevel.rotations import rotate_about_vertical
 from lowlevel.simulation import BatchSimulation
 from lowlevel.terrain import MAP_CELLS, MAP_RESOLUTION
+from robots.errors import PilotError
 from robots.g1.constants import ARM_JOINTS, JOINT_NAMES
 
 APPLICATION = "open_pilot"
@@ -44,12 +45,12 @@ class Recorder:
         live: open a viewer and stream to it.
 
     Raises:
-        ValueError: if a viewer is wanted where there is no display.
+        PilotError: if a viewer is wanted where there is no display.
     """
 
     def __init__(self, path: Path | None, live: bool = False) -> None:
         if live and sys.platform.startswith("linux") and not ({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)):
-            raise ValueError("a live view needs a display: leave out --live and open the recording")
+            raise PilotError("a live view needs a display: leave out --live and open the recording")
         self._path = path
         self._partial = None if path is None else path.with_name(f".{path.name}.partial")
         self.stream = rr.RecordingStream(APPLICATION)
@@ -85,7 +86,7 @@ class Recorder:
         """Log all visible geometry of ``model`` once.
 
         Raises:
-            ValueError: if a visible geom is neither mesh, box nor plane.
+            PilotError: if a visible geom is neither mesh, box nor plane.
         """
         self.stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for body in range(model.nbody):
@@ -191,8 +192,7 @@ class EpisodeRecording:
 def record_episodes(arena: Arena, episodes: Sequence[Episode], folder: Path) -> list[Path]:
     """Run a batch of low-level episodes and write one file for each; a repeated episode goes as before."""
     twin = VisualTwin(arena.terrain.add_to)
-    network = arena.controller.config.network
-    experts = network.experts if network.mixture else 1
+    experts = arena.controller.experts
     paths = [folder / f"episode_{number}.rrd" for number in range(len(episodes))]
     with ExitStack() as stack:
         films = [EpisodeRecording(stack.enter_context(Recorder(path)), twin, experts) for path in paths]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -13,36 +12,25 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.statistics import Figure
-from lowlevel.checks import NonFiniteError
 from lowlevel.provenance import git_revision
+from robots.errors import PilotError
 
 METRICS_FILE, REPORT_FILE = "metrics.json", "report.md"
-
-
-def run_command(name: str, command: Callable[[], None]) -> None:
-    """Run a command-line program: bad input and Ctrl-C end it with one line and a non-zero exit status."""
-    try:
-        command()
-    except (ValueError, OSError, NonFiniteError) as error:
-        sys.exit(f"{name}: {error}")
-    except KeyboardInterrupt:
-        print(f"{name}: interrupted, nothing was written", file=sys.stderr)
-        sys.exit(130)
 
 
 def check_output(folder: Path) -> None:
     """Find out before hours of work whether results can be written to ``folder``; creates nothing.
 
     Raises:
-        ValueError: if they cannot.
+        PilotError: if they cannot.
     """
     existing = folder.absolute()
     while not existing.exists():
         existing = existing.parent
     if not existing.is_dir():
-        raise ValueError(f"cannot write to {folder}: {existing} is not a folder")
+        raise PilotError(f"cannot write to {folder}: {existing} is not a folder")
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise ValueError(f"cannot write to {folder}: no permission to write in {existing}")
+        raise PilotError(f"cannot write to {folder}: no permission to write in {existing}")
 
 
 def write_results(folder: Path, write: Callable[[Path], None]) -> None:

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from evaluation.harness import Arena, Episode, HandLoad, Moment, Push, episode_seeds, run_all
+from evaluation.harness import Arena, Episode, HandLoad, Push, episode_seeds
 from evaluation.reports import format_figure, markdown_table
 from evaluation.statistics import Figure, mean_figure, share_figure
+from evaluation.trace import Channel, Trace, record, time_mean
 from evaluation.tracking import TILE_SIZE
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY, CommandSpace
 from lowlevel.measures import height_error, torso_error
@@ -34,7 +34,7 @@ elbows closer to the body the forearms would lean on the thighs in the deep bend
 BOX_LOAD = HandLoad(outward=15.0, downward=5.0, begin=1.0)
 """A box of 1 kg squeezed with 15 N, as far as its forces go; its inertia is left out."""
 
-PUSH_SPEED = 0.5
+PUSH_SPEED = 0.8
 """Velocity change of a push [m/s]."""
 REST_SPEED, REST_WINDOW = 0.1, 0.2
 """A foot moves if it covers a window [s] at more than this mean speed [m/s]: every step does, trembling does not."""
@@ -110,6 +110,12 @@ LOADED_WALK = Skill(
     load=BOX_LOAD,
     holds=True,
 )
+FAST_WALK = Skill(
+    "fast_walk",
+    "walk at 0.98 m/s for 10 s. Success: no fall. The speed is the mean forward one from 2 s on.",
+    (Phase(10.0, forward=0.98),),
+    measured=(2.0, 10.0),
+)
 STOP = Skill(
     "stop",
     "walk at 0.6 m/s for 4 s, then stand for 12 s. Success: no fall; from 2 s after the stop on no foot moves at more "
@@ -127,7 +133,7 @@ PUSH = Skill(
     measured=(1.0, 8.0),
     push_times=(1.0, 4.0),
 )
-SKILLS = (DEEP_BEND, LOADED_BEND, UNLOADED_BEND, LOADED_WALK, STOP, PUSH)
+SKILLS = (DEEP_BEND, LOADED_BEND, UNLOADED_BEND, LOADED_WALK, FAST_WALK, STOP, PUSH)
 
 
 def skill_episodes(skill: Skill, space: CommandSpace, count: int, seed: int) -> list[Episode]:
@@ -150,77 +156,31 @@ def skill_episodes(skill: Skill, space: CommandSpace, count: int, seed: int) -> 
             for time, angle in zip(skill.push_times, directions, strict=True)
         )
         flags = torch.ones(len(starts))
-        episodes.append(Episode(world_seed, skill.duration, starts, commands, flags, pushes=pushes, load=skill.load))
+        schedule = (world_seed, skill.duration, starts, commands, flags)
+        episodes.append(Episode(*schedule, pushes=pushes, load=skill.load, stands_up=False))
     return episodes
 
 
 # -- running them --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Trace:
-    """E equally long episodes, T control steps; NaN after an episode's end."""
-
-    period: float
-    """[s]"""
-    fell: np.ndarray
-    """(E,)"""
-    height_error: np.ndarray
-    """Measured - commanded (E, T) [m]."""
-    pitch_error: np.ndarray
-    """Of the torso (E, T) [rad]."""
-    forward_speed: np.ndarray
-    """Of the pelvis in the heading frame (E, T) [m/s]."""
-    position: np.ndarray
-    """Of the pelvis in the ground plane (E, T, 2) [m]."""
-    heading: np.ndarray
-    """(E, T) [rad]"""
-    foot_position: np.ndarray
-    """(E, T, 2, 3) [m]"""
-    arms: np.ndarray
-    """Arm joints (E, T, 14) [rad]."""
-
-    def steps(self, begin: float, end: float) -> slice:
-        """The control steps that end after ``begin`` and not after ``end`` [s]."""
-        return slice(round(begin / self.period), round(end / self.period))
-
-
-_CHANNELS: dict[str, tuple[tuple[int, ...], Callable[[Moment], Tensor]]] = {
-    "height_error": ((), lambda moment: height_error(moment.measured, moment.command)),
-    "pitch_error": ((), lambda moment: torso_error(moment.measured, moment.command)[:, 1]),
-    "forward_speed": ((), lambda moment: moment.measured.linear_velocity[:, 0]),
-    "position": ((2,), lambda moment: moment.measured.robot.base_position[:, :2]),
-    "heading": ((), lambda moment: moment.measured.heading),
-    "foot_position": ((2, 3), lambda moment: moment.measured.robot.foot_position),
-    "arms": ((14,), lambda moment: moment.measured.robot.joint_position[:, ARM_JOINTS]),
+CHANNELS: dict[str, Channel] = {
+    "height_error": Channel(lambda moment: height_error(moment.measured, moment.command)),
+    "pitch_error": Channel(lambda moment: torso_error(moment.measured, moment.command)[:, 1]),
+    "forward_speed": Channel(lambda moment: moment.measured.linear_velocity[:, 0]),
+    "position": Channel(lambda moment: moment.measured.robot.base_position[:, :2], (2,)),
+    "heading": Channel(lambda moment: moment.measured.heading),
+    "foot_position": Channel(lambda moment: moment.measured.robot.foot_position, (2, 3)),
+    "arms": Channel(lambda moment: moment.measured.robot.joint_position[:, ARM_JOINTS], (14,)),
 }
-"""What a trace holds: name -> (shape, function of a moment giving (N, *shape))."""
-
-
-def record(arena: Arena, episodes: Sequence[Episode], advance: Callable[[int], None] = lambda steps: None) -> Trace:
-    """Run ``episodes``, all of the same duration."""
-    count, length = len(episodes), round(episodes[0].duration / arena.period)
-    channels = {name: np.full((count, length, *shape), np.nan) for name, (shape, _) in _CHANNELS.items()}
-    fell = np.zeros(count, dtype=bool)
-
-    def observe(first: int, batch: Sequence[Episode]) -> Callable[[Moment], None]:
-        def add(moment: Moment) -> None:
-            (rows,) = moment.active[: len(batch)].numpy().nonzero()
-            for name, (_, function) in _CHANNELS.items():
-                channels[name][first + rows, moment.step] = function(moment).numpy()[rows]
-            fell[first : first + len(batch)] |= moment.fell[: len(batch)].numpy()
-
-        return add
-
-    run_all(arena, episodes, observe, advance)
-    return Trace(period=arena.period, fell=fell, **channels)
+"""Of the pelvis and the feet in the world, errors measured - commanded."""
 
 
 def run_skills(
     arena: Arena, episodes: Mapping[str, Sequence[Episode]], advance: Callable[[int], None] = lambda steps: None
 ) -> dict[str, Figure]:
     """Run every test's episodes, by name, on flat ground and reduce them to figures."""
-    return skill_figures({name: record(arena, batch, advance) for name, batch in episodes.items()})
+    return skill_figures({name: record(arena, batch, CHANNELS, advance) for name, batch in episodes.items()})
 
 
 # -- figures -------------------------------------------------------------------------------------------------
@@ -232,19 +192,20 @@ def skill_figures(traces: Mapping[str, Trace]) -> dict[str, Figure]:
     Means are over the steps before a fall; an episode that falls before its measured time has none.
     """
     figures = {
-        f"{skill.name}_success": share_figure(~traces[skill.name].fell)
-        for skill in (DEEP_BEND, LOADED_BEND, LOADED_WALK, PUSH)
+        f"{skill.name}_success": share_figure(~traces[skill.name].has_fallen)
+        for skill in (DEEP_BEND, LOADED_BEND, LOADED_WALK, FAST_WALK, PUSH)
     }
     for skill in (DEEP_BEND, LOADED_BEND):
         trace = traces[skill.name]
         held = trace.steps(*skill.measured)
-        figures[f"{skill.name}_height_error"] = mean_figure(_time_mean(np.abs(trace.height_error[:, held])), "m")
-        figures[f"{skill.name}_pitch_error"] = mean_figure(_time_mean(np.abs(trace.pitch_error[:, held])), "rad")
+        figures[f"{skill.name}_height_error"] = mean_figure(time_mean(np.abs(trace["height_error"][:, held])), "m")
+        figures[f"{skill.name}_pitch_error"] = mean_figure(time_mean(np.abs(trace["pitch_error"][:, held])), "rad")
     displacement = palm_displacement(traces[LOADED_BEND.name], traces[UNLOADED_BEND.name], LOADED_BEND.measured)
     figures["loaded_bend_palm_displacement"] = mean_figure(displacement, "m")
-    walk = traces[LOADED_WALK.name]
-    speed = _time_mean(walk.forward_speed[:, walk.steps(*LOADED_WALK.measured)])
-    figures["loaded_walk_speed"] = mean_figure(speed, "m/s")
+    for skill in (LOADED_WALK, FAST_WALK):
+        walk = traces[skill.name]
+        speed = time_mean(walk["forward_speed"][:, walk.steps(*skill.measured)])
+        figures[f"{skill.name}_speed"] = mean_figure(speed, "m/s")
     stop = traces[STOP.name]
     rests = feet_rest(stop, STOP.measured[0])
     moved, turned = drift(stop, *STOP.measured)
@@ -256,7 +217,9 @@ def skill_figures(traces: Mapping[str, Trace]) -> dict[str, Figure]:
 
 def palm_displacement(loaded: Trace, unloaded: Trace, time: tuple[float, float]) -> np.ndarray:
     """Distance in the torso frame of the palms' mean places with and without a load (E,) [m], mean of both hands."""
-    with_load, without = (palms_in_torso(_time_mean(trace.arms[:, trace.steps(*time)])) for trace in (loaded, unloaded))
+    with_load, without = (
+        palms_in_torso(time_mean(trace["arms"][:, trace.steps(*time)])) for trace in (loaded, unloaded)
+    )
     return np.linalg.norm(with_load - without, axis=-1).mean(axis=-1)
 
 
@@ -275,24 +238,17 @@ def palms_in_torso(arms: np.ndarray) -> np.ndarray:
 def feet_rest(trace: Trace, since: float) -> np.ndarray:
     """Whether no foot moves from ``since`` [s] to the end, by REST_SPEED and REST_WINDOW (E,); false after a fall."""
     window = round(REST_WINDOW / trace.period)
-    places = trace.foot_position[:, round(since / trace.period) - 1 :]
+    places = trace["foot_position"][:, round(since / trace.period) - 1 :]
     moved = np.linalg.norm(places[:, window:] - places[:, :-window], axis=-1)
-    return (moved <= REST_SPEED * REST_WINDOW).all(axis=(1, 2)) & ~trace.fell
+    return (moved <= REST_SPEED * REST_WINDOW).all(axis=(1, 2)) & ~trace.has_fallen
 
 
 def drift(trace: Trace, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
     """How far the pelvis has moved [m] and turned [rad] between two times [s] (E,); NaN after a fall."""
     first, last = (round(time / trace.period) - 1 for time in (begin, end))
-    moved = np.linalg.norm(trace.position[:, last] - trace.position[:, first], axis=-1)
-    turned = trace.heading[:, last] - trace.heading[:, first]
+    moved = np.linalg.norm(trace["position"][:, last] - trace["position"][:, first], axis=-1)
+    turned = trace["heading"][:, last] - trace["heading"][:, first]
     return moved, np.abs((turned + np.pi) % (2.0 * np.pi) - np.pi)
-
-
-def _time_mean(values: np.ndarray) -> np.ndarray:
-    """Mean over axis 1, leaving out NaN; NaN where there is nothing else."""
-    counts = (~np.isnan(values)).sum(axis=1)
-    with np.errstate(invalid="ignore"):
-        return np.nansum(values, axis=1) / counts
 
 
 # -- report --------------------------------------------------------------------------------------------------
@@ -316,20 +272,22 @@ class Bar:
 
 
 BARS: dict[str, Bar | None] = {
-    "deep_bend_success": Bar(0.95),
+    "deep_bend_success": Bar(1.0),
     "deep_bend_height_error": Bar(0.03, at_most=True),
     "deep_bend_pitch_error": Bar(0.10, at_most=True),
-    "loaded_bend_success": Bar(0.90),
+    "loaded_bend_success": Bar(1.0),
     "loaded_bend_height_error": None,
     "loaded_bend_pitch_error": None,
     "loaded_bend_palm_displacement": None,
-    "loaded_walk_success": Bar(0.95),
+    "loaded_walk_success": Bar(1.0),
     "loaded_walk_speed": None,
+    "fast_walk_success": None,
+    "fast_walk_speed": Bar(0.90),
     "stop_success": None,
-    "stop_rest": None,
+    "stop_rest": Bar(1.0),
     "stop_drift": Bar(LARGEST_DRIFT, at_most=True),
     "stop_turn": None,
-    "push_success": Bar(0.95),
+    "push_success": Bar(0.9),
 }
 """Rows of the report's table and the bar of each."""
 

@@ -43,9 +43,8 @@ def window_rates(step: Callable[[], int], seconds: float, windows: int = WINDOWS
 # -- low level -----------------------------------------------------------------------------------------------
 
 
-def measure_training(config: TrainingConfig, folder: Path, updates: int) -> tuple[dict[str, Figure], Trainer]:
-    """End-to-end training with the full network, and the trainer."""
-    trainer = Trainer(config, folder)
+def measure_training(trainer: Trainer, updates: int, name: str) -> dict[str, Figure]:
+    """End-to-end training, as figures that begin with ``name``."""
     trainer.observation = trainer.environment.reset(spread_episodes=True)
     trainer.iterate()
     rates, shares = [], []
@@ -56,9 +55,9 @@ def measure_training(config: TrainingConfig, folder: Path, updates: int) -> tupl
         rates.append((trainer.steps - before) / elapsed)
         shares.append(1.0 - collected / elapsed)
     return {
-        "training_steps_per_second": mean_figure(rates, "1/s"),
-        "training_update_share": mean_figure(shares, "1"),
-    }, trainer
+        f"{name}_steps_per_second": mean_figure(rates, "1/s"),
+        f"{name}_update_share": mean_figure(shares, "1"),
+    }
 
 
 class _TimedSimulation:

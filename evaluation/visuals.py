@@ -11,6 +11,7 @@ from collections.abc import Callable
 import mujoco
 
 from lowlevel.simulation import BatchSimulation
+from robots.errors import PilotError
 from robots.g1.model import ModelOptions, build_spec
 
 VISIBLE_GROUPS = range(3)
@@ -45,11 +46,11 @@ class VisualTwin:
         """Take the pose that simulation ``row`` has now.
 
         Raises:
-            ValueError: if the simulated scene has other joints.
+            PilotError: if the simulated scene has other joints.
         """
         position = simulation.robot_data(row).qpos
         if len(position) != self.model.nq:
-            raise ValueError(
+            raise PilotError(
                 f"the simulated scene has {len(position)} coordinates, the visual one {self.model.nq}: "
                 "add the same objects to both"
             )

@@ -24,6 +24,7 @@ from evaluation.harness import (
 from lowlevel.commands import HEIGHT, VELOCITY
 from lowlevel.controller import Controller
 from lowlevel.observation import NoiseConfig
+from lowlevel.randomization import RandomizationConfig
 from lowlevel.terrain import TerrainConfig
 from robots.g1.constants import FOOT_BODIES, HAND_BODIES, NUM_JOINTS
 
@@ -121,7 +122,7 @@ def test_commands_switch_on_time_and_are_clamped(arena: Arena, controller: Contr
 
 
 def test_a_push_changes_the_velocity_of_its_robot_only(controller: Controller) -> None:
-    arena = Arena(controller, FLAT, QUIET, num_threads=1, batch=4)
+    arena = Arena(controller, FLAT, noise=QUIET, num_threads=1, batch=4)
     pushed, left_alone = standing(controller, 2)
     pushed = replace(pushed, pushes=(Push(0.1, (0.8, 0.0, 0.0)),))
     before, after = (
@@ -165,23 +166,73 @@ def test_a_load_bears_on_its_robot_from_its_time_on(arena: Arena, controller: Co
     assert torch.equal(palms[4][0], unloaded[4][0]) and torch.equal(palms[-1][1], unloaded[-1][1])
 
 
-def test_a_fall_ends_its_episode_only(arena: Arena, controller: Controller) -> None:
-    hit, spared = standing(controller, 2, duration=0.4)
+def test_a_fall_ends_its_command_and_the_next_one_begins_from_standing(arena: Arena, controller: Controller) -> None:
+    hit, spared = standing(controller, 2, duration=1.6)
+    neutral = hit.commands
+    two = replace(hit, starts=(0.0, 0.8), commands=neutral.repeat(2, 1), flags=torch.ones(2))
+    two = replace(two, pushes=(Push(0.0, (0.0, 12.0, 0.0)),))
+    hit = replace(hit, pushes=two.pushes)
+    moments = list(arena.run([hit, spared, two]))
+    fell, active = (torch.stack([getattr(moment, name) for moment in moments]) for name in ("fell", "active"))
+    assert fell[:40].sum(dim=0).tolist()[0] == 1 and fell[:40].sum(dim=0).tolist()[2] == 1
+    for row in (0, 2):
+        when = int(fell[:, row].nonzero()[0])
+        assert when < 40 and active[: when + 1, row].all() and not active[when + 1 : 40, row].any()
+    assert not active[40:, 0].any() and active[40, 2]
+    risen = moments[40].measured
+    assert risen.base_height[2] == pytest.approx(0.765, abs=0.02) and risen.projected_gravity[2, 2] < -0.9
+    assert moments[39].number.tolist()[2] == 0 and moments[40].number.tolist()[2] == 1
+    assert not active[:, 3:].any()
+    down = list(arena.run([replace(two, stands_up=False)]))
+    assert len(down) < 40
+
+
+def test_robots_that_lie_are_not_simulated(arena: Arena, controller: Controller) -> None:
+    hit, spared = standing(controller, 2, duration=1.2)
     hit = replace(hit, pushes=(Push(0.0, (0.0, 12.0, 0.0)),))
-    moments = list(arena.run([hit, spared]))
-    fell = torch.stack([moment.fell for moment in moments])
-    active = torch.stack([moment.active for moment in moments])
-    assert fell.sum(dim=0).tolist()[:2] == [1, 0]
-    when = int(fell[:, 0].nonzero()[0])
-    assert active[: when + 1, 0].all() and not active[when + 1 :, 0].any()
-    assert active[:, 1].all() and len(moments) == 20
-    assert not active[:, 2:].any()
+    places = [moment.measured.robot.joint_position[0] for moment in arena.run([hit, spared]) if not moment.active[0]]
+    assert len(places) > 2 and torch.equal(places[0], places[-1])
+
+
+def test_targets_that_are_not_finite_are_no_fall(controller: Controller) -> None:
+    class Failing:
+        def __getattr__(self, name: str) -> object:
+            return getattr(controller, name)
+
+        def act(self, *inputs: torch.Tensor) -> torch.Tensor:
+            targets = controller.act(*inputs)  # type: ignore[arg-type]
+            targets[1] = torch.nan
+            return targets
+
+    arena = Arena(Failing(), FLAT, num_threads=1, batch=2)  # type: ignore[arg-type]
+    moments = list(arena.run(standing(controller, 2)))
+    assert moments[0].failed.tolist() == [False, True] and not torch.stack([m.fell for m in moments]).any()
+    assert len(moments) == 10 and not moments[1].active[1]
+
+
+def test_work_is_torque_times_angle_over_the_physics_steps(controller: Controller) -> None:
+    """Against MuJoCo's own actuator power, integrated with a hundredth of the step."""
+    arena = Arena(controller, FLAT, noise=QUIET, num_threads=1, batch=1)
+    moment = next(arena.run(standing(controller, 1)))
+    simulation = arena.simulation
+    model, data = simulation.robot_model(0), simulation.robot_data(0)
+    targets = moment.targets + 0.1
+    work = simulation.step_with_work(targets, torch.tensor([0]))
+    data.ctrl[:NUM_JOINTS] = targets[0].numpy()
+    expected = 0.0
+    for _ in range(10):
+        mujoco.mj_step1(model, data)
+        before = data.qvel.copy()
+        mujoco.mj_step2(model, data)
+        middle = 0.5 * (before + data.qvel)[6 : 6 + NUM_JOINTS]
+        expected += 0.002 * float(np.abs(data.actuator_force[:NUM_JOINTS] * middle).sum())
+    assert work[0].item() == pytest.approx(expected, rel=0.15) and work[0] > 0.1
 
 
 def test_noise_reaches_what_the_controller_sees_but_not_what_is_measured(controller: Controller) -> None:
     episodes = standing(controller, 1)
     noisy = Arena(controller, FLAT, num_threads=1, batch=1)
-    quiet = Arena(controller, FLAT, QUIET, num_threads=1, batch=1)
+    quiet = Arena(controller, FLAT, noise=QUIET, num_threads=1, batch=1)
     seen = [next(arena.run(episodes)) for arena in (noisy, quiet)]
     spread = seen[0].elevation - seen[1].elevation
     assert 0.015 < spread.abs().max() <= 0.02
@@ -205,6 +256,17 @@ def test_the_robot_has_the_controllers_gains(untrained_controller: Path) -> None
     np.testing.assert_allclose(model.actuator_biasprm[:NUM_JOINTS, 2], -controller.gains.damping)
 
 
+def test_conditions_delay_and_weaken(controller: Controller) -> None:
+    conditions = replace(RandomizationConfig.for_evaluation(), delay=(0.0, 0.0, 1.0), effort_scale=0.5)
+    arena = Arena(controller, FLAT, conditions, num_threads=1, batch=1)
+    controls, targets = [], []
+    for moment in arena.run(standing(controller, 1)):
+        targets.append(moment.targets[0].numpy())
+        controls.append(arena.simulation.robot_data(0).ctrl[:NUM_JOINTS].copy())
+    np.testing.assert_allclose(controls[5], targets[3], atol=1e-6)
+    assert arena.simulation.robot_model(0).actuator("left_knee_joint").forcerange[1] == pytest.approx(0.5 * 139.0)
+
+
 def test_seeds_of_different_episodes_differ() -> None:
     seeds = {seed for index in range(50) for seed in episode_seeds(3, index)}
     assert len(seeds) == 100
@@ -213,7 +275,7 @@ def test_seeds_of_different_episodes_differ() -> None:
 
 def test_forward_means_forward_in_the_heading_frame(controller: Controller) -> None:
     """A push along the robot's own heading shows up as vx, whatever the heading."""
-    arena = Arena(controller, FLAT, QUIET, num_threads=1, batch=1)
+    arena = Arena(controller, FLAT, noise=QUIET, num_threads=1, batch=1)
     (episode,) = standing(controller, 1)
     heading = next(arena.run([episode])).measured.heading[0].item()
     along = (float(np.cos(heading)), float(np.sin(heading)), 0.0)
