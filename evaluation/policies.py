@@ -18,7 +18,7 @@ def controller_for(planner: str, named: Path | None) -> Path:
     """The ``named`` controller folder, or else the shipped one that the ``planner`` was trained on; both can be loaded.
 
     Raises:
-        PlannerError, ControllerError, FileNotFoundError: if one of them cannot be used, or not with the other.
+        PilotError: if one of them cannot be used, or not with the other.
     """
     loaded = None if planner == SCRIPTED else Planner.load(planner)
     folder = find_controller(named, loaded.config.controller if loaded else None)

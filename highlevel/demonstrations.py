@@ -46,7 +46,7 @@ class Source:
         """Check that the numbers mean what ``wanted`` needs them to.
 
         Raises:
-            ValueError: naming the first thing that differs.
+            PilotError: naming the first thing that differs.
         """
         for field in fields(self):
             if field.name != "controller" and getattr(self, field.name) != getattr(wanted, field.name):

@@ -40,8 +40,7 @@ def read_config(folder: Path) -> PlannerTrainingConfig:
     """The configuration of an existing run.
 
     Raises:
-        FileNotFoundError: if the folder holds no run.
-        ValueError: if its description is damaged or was written by another version.
+        PilotError: if the folder holds no run, or its description is damaged or was written by another version.
     """
     config = read_run_config(folder, PlannerTrainingConfig)
     controller, demonstrations = (
@@ -59,8 +58,7 @@ def read_state(folder: Path) -> dict[str, Any]:
     """The training state.
 
     Raises:
-        FileNotFoundError: if the run ended before it saved one.
-        ValueError: if it is damaged.
+        PilotError: if the run ended before it saved one, or it is damaged.
     """
     return read_training_state(find_state(folder))
 

@@ -89,7 +89,7 @@ class PlannerTrainingConfig:
         """Check the numbers that would fail late.
 
         Raises:
-            ValueError: naming the first one that does not fit.
+            PilotError: naming the first one that does not fit.
         """
         counts = {
             "num_threads": self.num_threads,

@@ -2,7 +2,7 @@
 
 The prior is a function of what the policy sees (clock and slewed velocity), so the sum of both is a policy, too. The
 student acts in the world without prior, and imitates what teacher and prior would do there (DAgger, Ross et al.,
-AISTATS 2011). A fade of the prior costs speed faster than PPO can take it over; this costs two minutes and no skill.
+AISTATS 2011). A fade of the prior costs speed faster than PPO can take it over; this costs minutes and no skill.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ class AbsorptionConfig:
     gradient_steps: int = 24
     """Per round."""
     minibatch: int = 6144
+    """Samples per gradient step."""
     learning_rate: float = 1e-3
     """Learning rate; a third of it in the last fifth of the rounds."""
 

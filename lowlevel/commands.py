@@ -68,7 +68,7 @@ def command_space(joint_lower: list[float], joint_upper: list[float]) -> Command
 
 @dataclass(frozen=True)
 class CommandKind:
-    """A box of commands that contains the neutral one, or lies ahead of it."""
+    """Ranges that commands of one kind are drawn from; what is not said stays neutral."""
 
     velocity: tuple[tuple[float, float], tuple[float, float], tuple[float, float]] = ((0.0, 0.0),) * 3
     """Ranges of vx, vy [m/s] and yaw rate [rad/s]."""
@@ -171,7 +171,7 @@ def shares(mixture: Mixture, device: torch.device | str = "cpu") -> Tensor:
     """Share of every kind (kinds,) in ``mixture``.
 
     Raises:
-        ValueError: naming a kind that is unknown, or if the shares do not add up to 1.
+        PilotError: naming a kind that is unknown, or if the shares do not add up to 1.
     """
     total = torch.zeros(len(KINDS), device=device)
     for name, share in mixture:

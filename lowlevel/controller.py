@@ -105,12 +105,14 @@ class Controller:
         step: ControlStep | OnnxStep,
         provenance: dict[str, Any],
         device: torch.device | str = "cpu",
+        pose: NominalPose | None = None,
     ) -> None:
+        """``pose`` is the robot's nominal-pose table, the package's own by default."""
         self.config = config
         self.provenance = provenance
         self.device = torch.device(device)
         self.gains = Gains(np.array(config.stiffness), np.array(config.damping), np.array(config.action_scale))
-        self.pose = NominalPose.load(device)
+        self.pose = NominalPose.load(device) if pose is None else pose
         self.step = step
         self._memory: Memory = {}
         self.gate = torch.zeros(0)
@@ -177,7 +179,7 @@ class Controller:
 
     def twin(self, num_robots: int) -> Controller:
         """A controller that shares the step and has a memory of its own for ``num_robots`` robots."""
-        twin = Controller(self.config, self.step, self.provenance, self.device)
+        twin = Controller(self.config, self.step, self.provenance, self.device, self.pose)
         twin.reset(num_robots)
         return twin
 

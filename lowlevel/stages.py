@@ -38,6 +38,7 @@ class Stage:
     arms_act: bool = False
     """Whether the policy corrects the arms: fourteen more noisy outputs that share every update's KL divergence."""
     mixture: Mixture = PROTOCOL
+    """Kinds of command and their shares."""
     terrain: TerrainConfig = field(default_factory=TerrainConfig)
     rewards: RewardWeights = field(default_factory=RewardWeights)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)

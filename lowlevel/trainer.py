@@ -48,7 +48,7 @@ STATE_FILE = "training_state.pt"
 class TrainingConfig:
     """A training run: task, stages, networks, learner and curriculum."""
 
-    total_steps: int = 400_000_000
+    total_steps: int = 250_000_000
     """Environment steps (robots times control steps), over all ranks."""
     seed: int = 0
     """Seed of weights, noise, commands and randomisation."""

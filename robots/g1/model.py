@@ -68,7 +68,7 @@ def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:
     """The robot as an editable MuJoCo specification; ``.compile()`` gives nq 36, nv 35, nu 29.
 
     Raises:
-        FileNotFoundError: if the URDF is not installed.
+        PilotError: if the URDF is not installed.
     """
     spec = mujoco.MjSpec.from_string(_urdf_with_floating_base(options.visuals))
     _set_physics(spec, options)

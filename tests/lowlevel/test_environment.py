@@ -1,11 +1,13 @@
 """The environment: finite, deterministic, honest about time limits, mirrored, and equal to the frozen controller."""
 
+import inspect
 from dataclasses import fields, replace
 
 import mujoco
 import pytest
 import torch
 
+from lowlevel import rewards
 from lowlevel.commands import HEIGHT, KINDS
 from lowlevel.controller import Controller, Proprioception
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
@@ -234,7 +236,15 @@ def test_a_robot_that_diverges_falls_and_the_others_do_not_notice() -> None:
 
 
 def test_every_reward_weight_has_a_term_and_every_term_a_weight() -> None:
-    assert {field.name for field in fields(RewardWeights)} == set(REWARD_TERMS)
+    terms = {
+        name
+        for name, function in vars(rewards).items()
+        if inspect.isfunction(function)
+        and not name.startswith("_")
+        and next(iter(inspect.signature(function).parameters.values())).annotation == "Transition"
+        and name != "compute_rewards"
+    }
+    assert {field.name for field in fields(RewardWeights)} == set(REWARD_TERMS) == terms
 
 
 def test_frozen_controller_repeats_the_training_policy(tmp_path) -> None:
