@@ -40,7 +40,7 @@ class RewardWeights:
     linear_velocity_fine: float = 0.0
     angular_velocity_fine: float = 0.0
     velocity_progress: float = 0.0
-    # Additions: the shape of a gait, for as long as there is none
+    # Additions: the shape of a gait
     foot_phase: float = 0.0
     contact_schedule: float = 0.0
     swing_height: float = 0.0
@@ -153,7 +153,7 @@ def large_feet_force(t: Transition) -> Tensor:
 
 
 def no_fly(t: Transition) -> Tensor:
-    """Exactly one foot on the ground while marching, both while standing."""
+    """Exactly one foot on the ground while the gait clock runs, both while standing."""
     return (t.measured.foot_contact.sum(-1) == torch.where(t.walking, 1, 2)).float()
 
 
