@@ -85,7 +85,10 @@ class CommandKind:
 
 
 _VELOCITY = ((-0.8, 1.2), (-0.5, 0.5), (-0.8, 0.8))
+_WALKING_HEIGHT = (0.55, 0.76)
 _WALKING_TORSO = ((-0.2, 0.2), (-0.2, 0.5), (-0.5, 0.5))
+WALKING_POSTURE = (_WALKING_HEIGHT, *_WALKING_TORSO)
+"""Ranges of height [m] and torso roll, pitch, yaw [rad] in which robots walk."""
 _TORSO = ((-0.4, 0.4), (-0.3, 1.5), (-1.5, 1.5))
 
 KINDS: dict[str, CommandKind] = {
@@ -95,7 +98,7 @@ KINDS: dict[str, CommandKind] = {
     "slow": CommandKind(velocity=((-0.3, 0.4), (-0.2, 0.2), (-0.3, 0.3)), steering=0.5),
     "walk": CommandKind(velocity=_VELOCITY),
     "squat": CommandKind(height=(0.30, 0.76), torso=((0.0, 0.0), (-0.1, 0.9), (0.0, 0.0)), tracks=True),
-    "walk_and_work": CommandKind(_VELOCITY, height=(0.55, 0.76), torso=_WALKING_TORSO, arms=True, tracks=True),
+    "walk_and_work": CommandKind(_VELOCITY, height=_WALKING_HEIGHT, torso=_WALKING_TORSO, arms=True, tracks=True),
     "stand_and_work": CommandKind(height=(0.30, 0.76), torso=_TORSO, arms=True, tracks=True),
 }
 """Kinds of command by name. Training draws few at a time: over the whole command space the policy gradient is nearly

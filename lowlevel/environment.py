@@ -108,6 +108,8 @@ class StepResult:
     """The clamped command that the step tracked (N, 21)."""
     kind: Tensor
     """Number of its kind in KINDS (N,)."""
+    commanded: Tensor
+    """Whether another command follows it (N,), one that neither policy nor critic could foresee."""
 
 
 class PilotEnvironment:
@@ -219,7 +221,7 @@ class PilotEnvironment:
             self._reset_robots(done)
             now = with_rows(now, done, take_snapshot(self.simulation.read(done), self.terrain))
         buffers.hand_force = self.randomizer.disturb(now.measured.robot, now.measured.heading)
-        self._resample_due_commands()
+        commanded = self._resample_due_commands()
         self._advance_reference()
         self._step_count += 1
         return StepResult(
@@ -232,6 +234,7 @@ class PilotEnvironment:
             measured=measured,
             command=command,
             kind=kind,
+            commanded=commanded,
         )
 
     def set_command(self, ids: Tensor, command: Tensor, flag: Tensor) -> None:
@@ -256,11 +259,14 @@ class PilotEnvironment:
         self.buffers.foot_contact_time = torch.where(contact, self.buffers.foot_contact_time + period, 0.0)
         self.buffers.foot_air_time = torch.where(contact, 0.0, self.buffers.foot_air_time + period)
 
-    def _resample_due_commands(self) -> None:
+    def _resample_due_commands(self) -> Tensor:
+        """Give new commands to robots whose time with the old one is over; returns which (N,)."""
         self.buffers.command_countdown -= self.control_period
-        due = torch.nonzero(self.buffers.command_countdown <= 0.0)[:, 0]
-        if len(due):
-            self._sample_commands(due)
+        due = self.buffers.command_countdown <= 0.0
+        ids = torch.nonzero(due)[:, 0]
+        if len(ids):
+            self._sample_commands(ids)
+        return due
 
     def _sample_commands(self, ids: Tensor) -> None:
         kinds = self.sampler.draw_kinds(len(ids), self.kind_probability, self.generator)

@@ -38,7 +38,7 @@ class GaitPriorConfig:
     """Knee flexion at mid-swing [rad]."""
     shift: float = 0.10
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
-    stride: tuple[float, float, float] = (0.35, 0.25, 0.25)
+    stride: tuple[float, float, float] = (0.35, 0.3, 0.35)
     """Hip swing per told vx, vy [rad per m/s] and yaw rate [rad per rad/s]. Half a stride is v T / 4 and the leg
     0.7 m long, which makes 0.25; loaded hips follow short of it."""
     stride_lead: float = 0.7

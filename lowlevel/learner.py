@@ -43,7 +43,7 @@ class PPOConfig:
 
     steps_per_update: int = 24
     """Control steps per robot and update, at first."""
-    epochs: int = 4
+    epochs: int = 2
     """Passes over the rollout per update."""
     minibatches: int = 4
     """Gradient steps per pass."""
@@ -51,6 +51,9 @@ class PPOConfig:
     """Discount per control step."""
     lam: float = 0.95
     """Decay of the generalised advantage estimate."""
+    advantage_limit: float = 2.0
+    """Normalised advantages are clipped to +- this: half a percent of the samples, of robots that fall, would else
+    outweigh all others."""
     clip: float = 0.2
     """Clipping range of the probability ratio."""
     desired_kl: float = 0.01

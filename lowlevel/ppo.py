@@ -154,7 +154,8 @@ class PPO:
         """Store what followed the last :meth:`act`.
 
         ``reward`` (N,); ``terminated`` (N,) bool, the episode ended in failure; ``truncated`` (N,) bool, it
-        ran out of time; ``next_privileged`` (N, P) as it was *before* any reset.
+        ran out of time, or what follows has nothing to do with the action; ``next_privileged`` (N, P) as it was
+        *before* any reset.
 
         Raises:
             NonFiniteError: if a reward or a privileged observation is not finite.
@@ -229,7 +230,8 @@ class PPO:
         count = advantages.numel() * world_size()
         mean = sum_over_ranks(advantages.sum()) / count
         variance = sum_over_ranks((advantages - mean).square().sum()) / count
-        storage.data["advantage"].copy_((advantages - mean) / (variance.sqrt() + 1e-8))
+        limit = self.config.advantage_limit
+        storage.data["advantage"].copy_(((advantages - mean) / (variance.sqrt() + 1e-8)).clamp(-limit, limit))
         return explained
 
     def _update_normalizers(self) -> None:

@@ -14,8 +14,8 @@ from lowlevel.trainer import TrainingConfig
 TRACKING = RewardWeights(
     linear_velocity=6.0,
     linear_velocity_fine=4.0,
-    angular_velocity=4.0,
-    angular_velocity_fine=2.0,
+    angular_velocity=5.0,
+    angular_velocity_fine=3.0,
     velocity_progress=4.0,
     base_height=3.0,
     torso_orientation=8.0,

@@ -14,7 +14,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lowlevel.commands import ARMS, COMMAND_SIZE, HEIGHT, POSTURE, TORSO, VELOCITY, clamp_posture, is_walking
+from lowlevel.commands import (
+    ARMS,
+    COMMAND_SIZE,
+    HEIGHT,
+    POSTURE,
+    TORSO,
+    VELOCITY,
+    WALKING_POSTURE,
+    clamp_posture,
+    is_walking,
+)
 from lowlevel.rotations import about_axis, conjugate, from_roll_pitch_yaw, multiply
 from robots.g1.arm_mass import ArmMass
 from robots.g1.constants import ARM_JOINTS, LOWER_JOINTS, Gains
@@ -28,7 +38,7 @@ GRAVITY = 9.81
 class ReferenceConfig:
     """How fast the command is followed, and how fast the robot steps."""
 
-    gait_frequency: float = 1.43
+    gait_frequency: float = 1.6
     """Steps of one foot per second [Hz]."""
     velocity_rate: float = 2.5
     """Slew rate of the velocity away from zero [m/s^2] and [rad/s^2]."""
@@ -84,6 +94,7 @@ class Reference:
         rate[TORSO], rate[ARMS] = torch.tensor(config.torso_rate, device=device), config.arm_rate
         braking = torch.cat([torch.full((VELOCITY.stop,), config.braking_rate, device=device), rate[HEIGHT:]])
         self._largest_change, self._largest_braking = rate * control_period, braking * control_period
+        self._lowest, self._highest = torch.tensor(WALKING_POSTURE, device=device).unbind(-1)
         self._phase_step = 2.0 * math.pi * config.gait_frequency * control_period
 
     def clamp(self, command: Tensor) -> Tensor:
@@ -94,15 +105,27 @@ class Reference:
         """One control step of slewing and gait clock towards ``command`` (N, 21).
 
         A robot told to stand finishes the step that it is in and makes one more: it follows its velocity command late,
-        and one that still moves when the clock rests topples over its feet.
+        and one that still moves when the clock rests topples over its feet. It stops before it squats, and stands up
+        before it walks.
         """
-        wanted = command - state.command
+        goal = self._goal(state, command)
+        wanted = goal - state.command
         largest = torch.where(wanted * state.command < 0.0, self._largest_braking, self._largest_change)
         change = wanted.clamp(-largest, largest)
         slewed = state.command + change
-        walks = is_walking(command) | is_walking(slewed)
+        walks = is_walking(goal) | is_walking(slewed)
         walking = (state.phase + self._phase_step) % (2.0 * math.pi)
         return ReferenceState(slewed, torch.where(walks, walking, self._stopping(state.phase)))
+
+    def _goal(self, state: ReferenceState, command: Tensor) -> Tensor:
+        """What ``state`` may head for by now (N, 21): deep postures wait for the last step, velocity for posture."""
+        posture = state.command[:, POSTURE]
+        upright = posture.clamp(self._lowest, self._highest)
+        ready = (posture - upright).abs().amax(dim=1, keepdim=True) < 1e-3
+        moves = state.walking[:, None] | is_walking(command)[:, None]
+        wanted = command[:, POSTURE]
+        within = torch.where(moves, wanted.clamp(self._lowest, self._highest), wanted)
+        return torch.cat([command[:, VELOCITY] * ready, within, command[:, ARMS]], dim=1)
 
     def _stopping(self, phase: Tensor) -> Tensor:
         """The next phase (N,) of robots that stop: from (0, pi) on to 4 pi, from (pi, 2 pi) on to 7 pi, then 0."""

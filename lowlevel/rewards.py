@@ -159,8 +159,8 @@ def no_fly(t: Transition) -> Tensor:
 
 SWING_HEIGHT = 0.09
 """Height of the sole at mid-swing [m]."""
-STANCE_WIDTH = 0.24
-"""Distance of the feet across the heading [m]; that of the hips."""
+STANCE_WIDTH = 0.18
+"""Distance of the feet across the heading [m]; that of the hips is 0.24, but the pelvis sways with it."""
 
 
 def _lift(t: Transition) -> Tensor:

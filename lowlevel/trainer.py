@@ -204,7 +204,9 @@ class Trainer:
         for _ in range(self.ppo.storage.steps):
             action = self.ppo.act(self.observation)
             result = self.environment.step(action.cpu())
-            self.ppo.record(result.reward, result.terminated, result.truncated, result.next_privileged)
+            # A new command changes what the future is worth, and no action is to blame for it.
+            interrupted = result.truncated | result.commanded
+            self.ppo.record(result.reward, result.terminated, interrupted, result.next_privileged)
             self.observation = result.observation
             self.curriculum.observe(result.kind, result.terms, result.terminated)
             terms.add(result.terms | {"total": result.reward / self.environment.control_period})

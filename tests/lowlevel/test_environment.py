@@ -177,6 +177,18 @@ def test_falls_terminate_and_time_limits_truncate() -> None:
     assert torch.stack([result.terminated for result in everything]).any(dim=0).all()
 
 
+def test_a_step_says_whether_another_command_follows() -> None:
+    environment = PilotEnvironment(replace(QUIET, num_robots=64, command_interval=(0.1, 0.4)))
+    environment.reset()
+    for _ in range(10):
+        before = environment.buffers.command
+        result = environment.step(torch.zeros(64, 29))
+        assert torch.equal(result.command, before)
+        changed = (environment.buffers.command != before).any(dim=1)
+        assert torch.equal(result.commanded, changed)
+    assert result.commanded.any() and not result.commanded.all()
+
+
 def test_robots_start_just_above_the_ground_as_fast_as_configured() -> None:
     config = replace(QUIET, num_robots=64, terrain=TerrainConfig(tiles=("irregular",)))
     for fastest in (0.0, 0.3):

@@ -45,7 +45,7 @@ def test_learning_rate_follows_the_kl_divergence() -> None:
 
 
 def test_only_the_actor_rate_adapts() -> None:
-    ppo = make_ppo(desired_kl=1e-9)
+    ppo = make_ppo(desired_kl=1e-9, epochs=4)
     run_update(ppo, 0)
     rates = {name: o.param_groups[0]["lr"] for name, o in ppo.learner.optimizers.items()}
     assert rates == {"actor": 1e-5, "critic": 5e-4, "estimator": 5e-4}
@@ -185,6 +185,18 @@ def test_timeouts_are_bootstrapped_with_the_state_before_the_reset() -> None:
         expected = torch.stack([torch.tensor(1.0), 1.0 + 0.5 * ppo.critic(final)[1]])
     ppo._store_returns(after["privileged"])
     torch.testing.assert_close(ppo.storage.flat("returns"), expected)
+
+
+def test_no_sample_outweighs_the_others() -> None:
+    ppo = make_ppo(robots=64, steps_per_update=1, minibatches=1, advantage_limit=1.5, gamma=0.0)
+    ppo.act(observation(torch.Generator().manual_seed(0), 64))
+    reward = torch.zeros(64)
+    reward[0], reward[1:4] = -100.0, 100.0
+    ended = torch.ones(64, dtype=torch.bool)
+    ppo.record(reward, ended, ~ended, torch.zeros(64, SIZES.privileged))
+    ppo._store_returns(torch.zeros(64, SIZES.privileged))
+    advantage = ppo.storage.data["advantage"][0]
+    assert advantage[0] == -1.5 and (advantage[1:4] == 1.5).all() and advantage[4:].abs().max() < 1.0
 
 
 def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:

@@ -32,7 +32,7 @@ def test_nothing_moves_faster_than_its_slew_rate_and_all_of_it_arrives(
     reference: Reference, space: CommandSpace
 ) -> None:
     start = space.neutral()[None]
-    command = reference.clamp(start + torch.tensor([0.8, 0.3, -0.6, -0.3, 0.1, 0.4, -0.5] + [0.4] * 14))
+    command = reference.clamp(start + torch.tensor([0.8, 0.3, -0.6, -0.2, 0.1, 0.4, -0.5] + [0.4] * 14))
     state = ReferenceState.standing(start)
     largest = torch.zeros(1, 21)
     for _ in range(100):
@@ -87,6 +87,24 @@ def test_a_robot_told_to_stop_lands_twice_and_may_walk_on_in_between(
     continued = reference.advance(reference.advance(begin, stand), walk)
     uninterrupted = reference.advance(reference.advance(begin, walk), walk)
     torch.testing.assert_close(reference.clock(continued), reference.clock(uninterrupted))
+
+
+def test_a_robot_stops_before_it_squats_and_stands_up_before_it_walks(
+    reference: Reference, space: CommandSpace
+) -> None:
+    walk, squat = space.neutral()[None], space.neutral()[None]
+    walk[:, 0], squat[:, HEIGHT], squat[:, TORSO.start + 1] = 0.6, 0.4, 0.9
+    state = ReferenceState.standing(space.neutral()[None])
+    seen = []
+    for command in (walk, squat, walk):
+        for _ in range(200):
+            state = reference.advance(state, command)
+            deep = state.command[0, HEIGHT] < 0.549 or state.command[0, TORSO.start + 1] > 0.501
+            seen.append((bool(state.walking), bool(deep)))
+        expected = {"walk": (True, False), "squat": (False, True)}["squat" if command is squat else "walk"]
+        assert seen[-1] == expected
+        torch.testing.assert_close(state.command, command)
+    assert (True, True) not in seen
 
 
 def test_the_pelvis_attitude_puts_the_torso_where_it_is_told(reference: Reference, space: CommandSpace) -> None:
