@@ -21,7 +21,16 @@ import torch
 import tyro
 from rich.progress import Progress
 
-from evaluation.reports import (
+from evaluation.protocols.speed import (
+    WINDOWS,
+    measure_environment,
+    measure_latency,
+    measure_training,
+    plain_rates,
+    planner_rates,
+    single_planner_rates,
+)
+from evaluation.reporting.reports import (
     METRICS_FILE,
     REPORT_FILE,
     check_output,
@@ -31,22 +40,13 @@ from evaluation.reports import (
     write_metrics,
     write_results,
 )
-from evaluation.speed import (
-    WINDOWS,
-    measure_environment,
-    measure_latency,
-    measure_training,
-    plain_rates,
-    planner_rates,
-    single_planner_rates,
-)
-from evaluation.statistics import Figure, mean_figure
+from evaluation.reporting.statistics import Figure, mean_figure
 from highlevel.task import load_task
-from lowlevel.command_line import command_line
-from lowlevel.controller import Controller, content_hash
+from lowlevel.control.controller import Controller, content_hash
 from lowlevel.export import export_controller
 from lowlevel.presets import PRESETS
-from lowlevel.progress import ProgressReport
+from lowlevel.runs.command_line import command_line
+from lowlevel.runs.progress import ProgressReport
 from lowlevel.trainer import Trainer, TrainingConfig
 from robots.errors import PilotError
 

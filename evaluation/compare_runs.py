@@ -11,9 +11,9 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from evaluation.plots import plot_overlays
-from lowlevel.command_line import command_line
-from lowlevel.training_log import LOG_FILE
+from evaluation.reporting.plots import plot_overlays
+from lowlevel.runs.command_line import command_line
+from lowlevel.runs.training_log import LOG_FILE
 from robots.errors import PilotError
 
 PANELS = {

@@ -14,25 +14,25 @@ import numpy as np
 import torch
 import tyro
 
-from evaluation.pictures import NoOpenGLError, Painter, film_strip, following_camera, save_picture
-from evaluation.policies import SCRIPTED, controller_for, make_policy
-from evaluation.recording import EpisodeRecording, Recorder
-from evaluation.reports import (
+from evaluation.pictures.painter import NoOpenGLError, Painter, film_strip, following_camera, save_picture
+from evaluation.pictures.recording import EpisodeRecording, Recorder
+from evaluation.pictures.visuals import VisualTwin
+from evaluation.protocols.policies import SCRIPTED, controller_for, make_policy
+from evaluation.reporting.reports import (
     REPORT_FILE,
     check_output,
     markdown_table,
     write_json,
     write_results,
 )
-from evaluation.visuals import VisualTwin
 from highlevel.action import interpolate
 from highlevel.environment import CommandEnvironment, PhysicsConfig, StepResult
 from highlevel.planner import planner_hash
 from highlevel.task import Decision, Outcome, Task, load_task, rows
-from lowlevel.command_line import command_line
-from lowlevel.controller import content_hash
-from lowlevel.measures import Measurement
-from lowlevel.progress import ProgressReport
+from lowlevel.control.controller import content_hash
+from lowlevel.runs.command_line import command_line
+from lowlevel.runs.progress import ProgressReport
+from lowlevel.world.measures import Measurement
 from robots.errors import PilotError
 
 RECORDING_FILE, OUTCOME_FILE, STRIP_FILE = "episode.rrd", "outcome.json", "stages.png"

@@ -11,16 +11,16 @@ import numpy as np
 import torch
 import tyro
 
-from evaluation.harness import Arena, constant
-from evaluation.pictures import Painter, film_strip, following_camera, save_picture
-from evaluation.reports import check_output
-from evaluation.skills import HOLDING_ARMS
-from evaluation.visuals import VisualTwin
+from evaluation.pictures.painter import Painter, film_strip, following_camera, save_picture
+from evaluation.pictures.visuals import VisualTwin
+from evaluation.protocols.arena import Arena, constant
+from evaluation.protocols.skills import HOLDING_ARMS
+from evaluation.reporting.reports import check_output
 from highlevel.registration import find_controller
-from lowlevel.command_line import command_line
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
-from lowlevel.controller import Controller
-from lowlevel.terrain import TerrainConfig
+from lowlevel.control.controller import Controller
+from lowlevel.runs.command_line import command_line
+from lowlevel.world.terrain import TerrainConfig
 from robots.errors import PilotError
 
 DURATION = 5.0

@@ -13,10 +13,11 @@ from typing import Any, get_args, get_type_hints
 import torch
 import tyro
 
-from evaluation.parallel import Run, Setting, run_all
-from evaluation.plots import plot_bars
-from evaluation.policies import SCRIPTED, controller_for
-from evaluation.reports import (
+from evaluation.protocols.parallel import Run, Setting, run_all
+from evaluation.protocols.policies import SCRIPTED, controller_for
+from evaluation.protocols.sweeps import SweepResult, cells, report_lines, sweep_figures, sweep_result, write_plots
+from evaluation.reporting.plots import plot_bars
+from evaluation.reporting.reports import (
     METRICS_FILE,
     REPORT_FILE,
     check_output,
@@ -27,14 +28,13 @@ from evaluation.reports import (
     write_metrics,
     write_results,
 )
-from evaluation.statistics import Figure, mean_figure, share_figure
-from evaluation.sweeps import SweepResult, cells, report_lines, sweep_figures, sweep_result, write_plots
+from evaluation.reporting.statistics import Figure, mean_figure, share_figure
 from highlevel.episodes import EpisodeRecord
 from highlevel.planner import planner_hash
 from highlevel.task import Task, load_task
-from lowlevel.command_line import command_line
-from lowlevel.controller import content_hash
-from lowlevel.progress import ProgressReport
+from lowlevel.control.controller import content_hash
+from lowlevel.runs.command_line import command_line
+from lowlevel.runs.progress import ProgressReport
 from robots.errors import PilotError
 
 EPISODES_FILE = "episodes.json"

@@ -13,22 +13,10 @@ import numpy as np
 import torch
 import tyro
 
-from evaluation.harness import BATCH, Arena, batch_steps
-from evaluation.plots import plot_bars, plot_curves, plot_heat_map
-from evaluation.reports import (
-    METRICS_FILE,
-    REPORT_FILE,
-    check_output,
-    format_figure,
-    markdown_table,
-    metrics,
-    write_metrics,
-    write_results,
-)
-from evaluation.skills import EPISODES as SKILL_EPISODES
-from evaluation.skills import FLAT, SKILLS, run_skills, skill_episodes, skills_section
-from evaluation.statistics import Figure
-from evaluation.tracking import (
+from evaluation.protocols.arena import BATCH, Arena, batch_steps
+from evaluation.protocols.skills import EPISODES as SKILL_EPISODES
+from evaluation.protocols.skills import FLAT, SKILLS, run_skills, skill_episodes, skills_section
+from evaluation.protocols.tracking import (
     AVERAGING,
     COMMAND_INTERVAL,
     EPISODE_LENGTH,
@@ -52,11 +40,23 @@ from evaluation.tracking import (
     tracking_figures,
     walking_episodes,
 )
-from lowlevel.command_line import command_line
-from lowlevel.controller import Controller, add_metrics, content_hash
-from lowlevel.measures import TRACKING_FIGURES
-from lowlevel.progress import ProgressReport
-from lowlevel.terrain import TerrainConfig
+from evaluation.reporting.plots import plot_bars, plot_curves, plot_heat_map
+from evaluation.reporting.reports import (
+    METRICS_FILE,
+    REPORT_FILE,
+    check_output,
+    format_figure,
+    markdown_table,
+    metrics,
+    write_metrics,
+    write_results,
+)
+from evaluation.reporting.statistics import Figure
+from lowlevel.control.controller import Controller, add_metrics, content_hash
+from lowlevel.runs.command_line import command_line
+from lowlevel.runs.progress import ProgressReport
+from lowlevel.world.measures import TRACKING_FIGURES
+from lowlevel.world.terrain import TerrainConfig
 from robots.errors import PilotError
 
 _BLIND = dict(zip(TRACKING_FIGURES, (0.145, 0.099, 0.010, 0.057, 0.053, 0.055, 0.206), strict=False))
@@ -224,7 +224,7 @@ def evaluate(
 
 
 def _record(controller: Controller, arguments: Arguments, folder: Path) -> None:
-    from evaluation.recording import record_episodes  # the viewer's library is large and seldom needed here
+    from evaluation.pictures.recording import record_episodes  # the viewer's library is large and seldom needed here
 
     terrain = suite_terrain(arguments.suite)
     conditions = conditions_of(arguments.condition)

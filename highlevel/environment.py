@@ -16,13 +16,12 @@ from torch import Tensor
 
 from highlevel.action import ActionMap, interpolate
 from highlevel.task import Decision, ObservationBlock, Task, rows
-from lowlevel.checks import require_finite
 from lowlevel.commands import COMMAND_SIZE, HEIGHT, POSTURE
-from lowlevel.controller import Controller, Proprioception
-from lowlevel.measures import Measurement, has_fallen, measure
-from lowlevel.rotations import about_axis, conjugate, multiply
-from lowlevel.simulation import BatchSimulation
-from lowlevel.terrain import Terrain, TerrainConfig
+from lowlevel.control.controller import Controller, Proprioception
+from lowlevel.runs.checks import require_finite
+from lowlevel.world.measures import Measurement, has_fallen, measure
+from lowlevel.world.simulation import BatchSimulation
+from lowlevel.world.terrain import Terrain, TerrainConfig
 from robots.errors import PilotError
 from robots.g1.constants import (
     DEFAULT_POSITION,
@@ -32,6 +31,7 @@ from robots.g1.constants import (
     WAIST_JOINTS,
 )
 from robots.g1.model import ModelOptions, build_spec
+from robots.rotations import about_axis, conjugate, multiply
 
 ROBOT_BLOCKS = (
     ObservationBlock("base_angular_velocity", 3, 1.0),

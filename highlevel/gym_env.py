@@ -13,7 +13,7 @@ from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.registration import find_controller
 from highlevel.task import Task, load_task
 from lowlevel.commands import COMMAND_SIZE
-from lowlevel.controller import Controller
+from lowlevel.control.controller import Controller
 from robots.errors import PilotError
 
 

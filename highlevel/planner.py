@@ -17,11 +17,11 @@ from torch import Tensor
 
 from highlevel.action import ActionConfig
 from highlevel.environment import CommandEnvironment
-from highlevel.policy import PlannerActor
+from highlevel.learning.policy import PlannerActor
 from highlevel.task import ObservationBlock
 from lowlevel.commands import COMMAND_SIZE
-from lowlevel.controller import content_hash
-from lowlevel.frozen_folder import FrozenFolder
+from lowlevel.control.controller import content_hash
+from lowlevel.runs.frozen_folder import FrozenFolder
 from robots.errors import PilotError
 
 FORMAT_VERSION = 1

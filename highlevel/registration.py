@@ -7,7 +7,7 @@ from pathlib import Path
 import gymnasium
 
 from highlevel.task import environment_id, task_names
-from lowlevel.controller import content_hash
+from lowlevel.control.controller import content_hash
 from robots.errors import PilotError
 
 CONTROLLERS = Path(__file__).resolve().parents[1] / "checkpoints" / "lowlevel"

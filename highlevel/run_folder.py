@@ -20,11 +20,11 @@ from typing import Any
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
-from highlevel.training_config import PlannerTrainingConfig
-from lowlevel.files import atomic_write
-from lowlevel.provenance import describe_run, find_state, make_run_folder, read_run_config, write_run_description
+from highlevel.learning.config import PlannerTrainingConfig
+from lowlevel.runs.files import atomic_write
+from lowlevel.runs.provenance import describe_run, find_state, make_run_folder, read_run_config, write_run_description
+from lowlevel.runs.training_log import LOG_FILE, drop_entries_after, write_entry
 from lowlevel.trainer import STATE_FILE, read_training_state
-from lowlevel.training_log import LOG_FILE, drop_entries_after, write_entry
 
 DEMONSTRATIONS_FILE = "demonstrations.npz"
 CLONED_FOLDER, BEST_FOLDER, TENSORBOARD_FOLDER = "cloned", "best", "tensorboard"

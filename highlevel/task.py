@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from highlevel.action import ActionConfig
-from lowlevel.measures import Measurement
-from lowlevel.simulation import BatchSimulation
+from lowlevel.world.measures import Measurement
+from lowlevel.world.simulation import BatchSimulation
 from robots.errors import PilotError
 
 
@@ -132,7 +132,7 @@ class Task(ABC):
     def reset(self, ids: Tensor, seed: int, episode: Tensor) -> Start:
         """Place the objects of robots ``ids`` (n,) for ``episode`` (n,) and say where the robots stand.
 
-        All randomness comes from :func:`highlevel.draws.uniform` with ``seed`` and ``episode``. The robots
+        All randomness comes from :func:`lowlevel.runs.draws.uniform` with ``seed`` and ``episode``. The robots
         have already been reset; the environment moves them and calls ``forward`` afterwards.
         """
 

@@ -11,13 +11,13 @@ from typing import Annotated
 import torch
 import tyro
 
-from highlevel.demonstrations import Demonstrations
+from highlevel.learning.config import PlannerTrainingConfig
+from highlevel.learning.demonstrations import Demonstrations
 from highlevel.registration import find_controller
 from highlevel.run_folder import BEST_FOLDER, create_run, read_config
 from highlevel.trainer import PlannerTrainer
-from highlevel.training_config import PlannerTrainingConfig
-from lowlevel.command_line import command_line
-from lowlevel.provenance import require_unused
+from lowlevel.runs.command_line import command_line
+from lowlevel.runs.provenance import require_unused
 from robots.errors import PilotError
 
 

@@ -14,13 +14,14 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
-from highlevel.cloning import clone
-from highlevel.demonstrations import Demonstrations, Source, record
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.episodes import run_episodes, stage_shares, success_rate
-from highlevel.learner import PlannerPPO
+from highlevel.learning.cloning import clone
+from highlevel.learning.config import PlannerTrainingConfig
+from highlevel.learning.demonstrations import Demonstrations, Source, record
+from highlevel.learning.policy import PlannerActor
+from highlevel.learning.ppo import PlannerPPO
 from highlevel.planner import Planner, PlannerConfig
-from highlevel.policy import PlannerActor
 from highlevel.run_folder import (
     BEST_FOLDER,
     CLONED_FOLDER,
@@ -32,12 +33,11 @@ from highlevel.run_folder import (
     write_state,
 )
 from highlevel.task import load_task
-from highlevel.training_config import PlannerTrainingConfig
 from highlevel.vec_env import PlannerVecEnv
-from lowlevel.controller import Controller, content_hash
-from lowlevel.interrupts import stop_on_signals
-from lowlevel.progress import ProgressReport
-from lowlevel.provenance import describe_run
+from lowlevel.control.controller import Controller, content_hash
+from lowlevel.runs.interrupts import stop_on_signals
+from lowlevel.runs.progress import ProgressReport
+from lowlevel.runs.provenance import describe_run
 from robots.errors import PilotError
 
 SELECTION_SEED, DEMONSTRATION_SEED, TRAINING_SEED = 1_000_000, 2_000_000, 3_000_000

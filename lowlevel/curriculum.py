@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lowlevel.commands import KINDS
-from lowlevel.distributed import sum_over_ranks
+from lowlevel.runs.distributed import sum_over_ranks
 
 QUALITY_TERMS = ("linear_velocity", "angular_velocity", "base_height", "torso_orientation")
 """Reward terms in [0, 1] whose mean is the quality of tracking."""

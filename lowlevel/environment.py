@@ -19,31 +19,33 @@ from lowlevel.commands import (
     CommandSampler,
     Mixture,
     command_space,
+    is_walking,
     shares,
 )
-from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
-from lowlevel.measures import Measurement, height_error, is_lost, torso_error
-from lowlevel.observation import (
+from lowlevel.control.observation import (
     PRIVILEGED_SIZE,
     FrameBuilder,
     NoiseConfig,
     push_history,
     start_history,
 )
-from lowlevel.randomization import RandomizationConfig, Randomizer
-from lowlevel.reference import Reference, ReferenceConfig, ReferenceState
+from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
+from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
-from lowlevel.rotations import about_axis, multiply, rotate_about_vertical
-from lowlevel.simulation import BatchSimulation
-from lowlevel.snapshot import Snapshot, take_snapshot, with_rows
-from lowlevel.terrain import STANCE_REACH, Terrain, TerrainConfig
+from lowlevel.world.measures import Measurement, height_error, is_lost, torso_error
+from lowlevel.world.randomization import RandomizationConfig, Randomizer
+from lowlevel.world.simulation import BatchSimulation
+from lowlevel.world.snapshot import Snapshot, take_snapshot, with_rows
+from lowlevel.world.terrain import STANCE_REACH, Terrain, TerrainConfig
 from robots.errors import PilotError
 from robots.g1.constants import ARM_JOINTS, NUM_JOINTS, WAIST_JOINTS, gain_set
 from robots.g1.model import ModelOptions, build_spec
+from robots.rotations import about_axis, multiply, rotate_about_vertical
 
 MAP_REFRESH_STEPS = 5
 """Control steps between refreshes of the elevation map: 10 Hz at 50 Hz control (paper IV-B)."""
-
+UNDER_WAY = 50
+"""Control steps after a reset from which a robot's velocity says something about its gait."""
 
 Value = TypeVar("Value")
 FromStage = Annotated[Value, tyro.conf.Suppress]
@@ -193,6 +195,10 @@ class PilotEnvironment:
 
         now = take_snapshot(self.simulation.read(), self.terrain)
         measured = now.measured
+        if self.config.gait_prior > 0.0:
+            walks = is_walking(buffers.reference.command) & (buffers.episode_step > UNDER_WAY)
+            walked = torch.cat([measured.linear_velocity[:, :2], measured.yaw_rate[:, None]], dim=1)
+            self.prior.observe(buffers.reference.command[walks, VELOCITY], walked[walks])
         buffers.previous_action, buffers.action = buffers.action, action
         buffers.episode_step += 1
         self._update_foot_times(measured)

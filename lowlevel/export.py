@@ -9,13 +9,13 @@ from typing import Any
 import torch
 import tyro
 
-from lowlevel.command_line import command_line
 from lowlevel.commands import KINDS
-from lowlevel.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
+from lowlevel.control.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
+from lowlevel.control.observation import FRAME, normalised_columns
 from lowlevel.environment import PilotEnvironment
-from lowlevel.networks import PilotActor
-from lowlevel.observation import FRAME, normalised_columns
-from lowlevel.provenance import find_state, git_revision, read_run_description, read_training_config
+from lowlevel.networks.actor import PilotActor
+from lowlevel.runs.command_line import command_line
+from lowlevel.runs.provenance import find_state, git_revision, read_run_description, read_training_config
 from lowlevel.trainer import Trainer
 from robots.errors import PilotError
 from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, GAINS, JOINT_NAMES

@@ -1,9 +1,9 @@
 """A bare gait that shows an untrained policy what stepping is; it exists in training only.
 
 No feedback, three motions: the swing leg lifts, the pelvis shifts over the stance foot, and the legs stride. The
-stride fits the speed that is told: a prior that walks at half of it leaves a policy that walks at half of it, long
-after the prior has gone, because the tracking rewards are flat far from their goal. When the robot walks, policy and
-prior are cloned into the policy alone (:mod:`lowlevel.absorption`).
+stride is fitted to the speed that is told while the robot learns: a prior that walks at half of it leaves a policy that
+walks at half of it, long after the prior has gone, because the tracking rewards are flat far from their goal. When the
+robot walks, policy and prior are cloned into the policy alone (:mod:`lowlevel.learning.absorption`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from lowlevel.commands import VELOCITY
-from lowlevel.reference import ReferenceState
+from lowlevel.control.reference import ReferenceState
+from lowlevel.runs.distributed import sum_over_ranks
 from robots.g1.constants import NUM_JOINTS, joint_index
 
 _ROWS: tuple[dict[str, float], ...] = (
@@ -27,6 +28,8 @@ _ROWS: tuple[dict[str, float], ...] = (
     {"left_hip_pitch": 1.0, "right_hip_pitch": -1.0, "left_ankle_pitch": -1.0, "right_ankle_pitch": 1.0},
     {"left_hip_roll": -1.0, "right_hip_roll": 1.0, "left_ankle_roll": 1.0, "right_ankle_roll": -1.0},
     {"left_hip_yaw": -1.0, "right_hip_yaw": 1.0},
+    # Feet closer to each other, and level.
+    {"left_hip_roll": -1.0, "right_hip_roll": 1.0, "left_ankle_roll": 1.0, "right_ankle_roll": -1.0},
 )
 
 
@@ -36,17 +39,25 @@ class GaitPriorConfig:
 
     lift: float = 0.9
     """Knee flexion at mid-swing [rad]."""
-    shift: float = 0.10
+    shift: float = 0.06
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
-    stride: tuple[float, float, float] = (0.35, 0.3, 0.35)
-    """Hip swing per told vx, vy [rad per m/s] and yaw rate [rad per rad/s]. Half a stride is v T / 4 and the leg
-    0.7 m long, which makes 0.25; loaded hips follow short of it."""
+    narrowing: float = 0.04
+    """Hip roll that brings the feet closer to each other than the hips are [rad]: the pelvis sways less."""
+    stride: tuple[float, float, float] = (0.35, 0.3, 0.25)
+    """First hip swing per told vx, vy [rad per m/s] and yaw rate [rad per rad/s]. Half a stride is v T / 4 and the leg
+    0.7 m long, which makes 0.22; loaded hips follow short of it."""
     stride_lead: float = 0.7
     """Phase by which the stride leads the gait clock, because loaded hips follow late [rad]."""
+    fitting_rate: float = 0.06
+    """Share of the stride's error that one update takes back."""
 
 
 class GaitPrior:
-    """The prior as a function of the reference alone."""
+    """The prior as a function of the reference alone, and the fit of its stride.
+
+    ``stride`` (3, 4): amplitudes of the three strides per told (vx, vy, yaw rate, 1). The last column is a creep: what
+    the robot walks when it is told to mark time.
+    """
 
     def __init__(self, config: GaitPriorConfig, device: torch.device | str = "cpu") -> None:
         self.config = config
@@ -55,7 +66,9 @@ class GaitPrior:
             for joint, share in joints.items():
                 row[joint_index(f"{joint}_joint")] = share
         self._rows = rows.to(device)
-        self._stride = torch.tensor(config.stride, device=device)
+        self.stride = first_stride(config).to(device)
+        self._told_told = torch.zeros(4, 4, device=device)
+        self._told_walked = torch.zeros(4, 3, device=device)
 
     def __call__(self, state: ReferenceState) -> Tensor:
         """Offsets of the joint targets (N, 29) [rad]; zero while standing."""
@@ -63,6 +76,39 @@ class GaitPrior:
         # The square lets the foot come to rest as it lands.
         lift = config.lift * torch.stack([sine, -sine], dim=1).clamp_min(0.0).square()
         swing = torch.cos(state.phase + config.stride_lead)[:, None]
-        stride = swing * state.command[:, VELOCITY] * self._stride
-        amounts = torch.cat([lift, config.shift * sine[:, None], stride], dim=1)
+        stride = swing * (_with_one(state.command[:, VELOCITY]) @ self.stride.T)
+        narrowing = torch.full_like(swing, config.narrowing)
+        amounts = torch.cat([lift, config.shift * sine[:, None], stride, narrowing], dim=1)
         return (amounts * state.walking[:, None]) @ self._rows
+
+    def observe(self, told: Tensor, walked: Tensor) -> None:
+        """Take in the velocities that robots were told and walked at, each (n, 3) in the heading frame."""
+        inputs = _with_one(told)
+        self._told_told += inputs.T @ inputs
+        self._told_walked += inputs.T @ walked
+
+    def fit(self) -> None:
+        """Move the stride towards one with which robots walk as told, by what was observed over all ranks.
+
+        A linear fit says how they walk for what they are told. What it mixes of forwards with sideways and turning is
+        chance, because the robot is symmetric.
+        """
+        told_told, told_walked = sum_over_ranks(torch.cat([self._told_told, self._told_walked], dim=1)).split((4, 3), 1)
+        self._told_told.zero_(), self._told_walked.zero_()
+        if told_told[3, 3] < 1000.0:
+            return
+        walks = torch.linalg.solve(told_told + torch.eye(4, device=told_told.device), told_walked).T
+        error = torch.eye(3, 4, device=walks.device) - walks
+        symmetric = torch.tensor([[1, 0, 0, 1], [0, 1, 1, 0], [0, 1, 1, 0]], device=walks.device)
+        scale = torch.tensor(self.config.stride, device=walks.device)[:, None]
+        change = self.config.fitting_rate * scale * error.clamp(-1.0, 1.0) * symmetric
+        self.stride = (self.stride + change).clamp(-1.0, 1.0)
+
+
+def first_stride(config: GaitPriorConfig) -> Tensor:
+    """The stride (3, 4) before any fit."""
+    return torch.cat([torch.tensor(config.stride).diag(), torch.zeros(3, 1)], dim=1)
+
+
+def _with_one(told: Tensor) -> Tensor:
+    return torch.cat([told, torch.ones_like(told[:, :1])], dim=1)

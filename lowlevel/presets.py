@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lowlevel.networks import NetworkConfig
-from lowlevel.randomization import RandomizationConfig
+from lowlevel.networks.actor import NetworkConfig
 from lowlevel.rewards import RewardWeights
 from lowlevel.stages import Stage
-from lowlevel.terrain import TerrainConfig
 from lowlevel.trainer import TrainingConfig
+from lowlevel.world.randomization import RandomizationConfig
+from lowlevel.world.terrain import TerrainConfig
 
 TRACKING = RewardWeights(
     linear_velocity=6.0,

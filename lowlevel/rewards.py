@@ -9,11 +9,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from lowlevel.checks import NonFiniteError
 from lowlevel.commands import STANDING_SPEED, is_walking
-from lowlevel.measures import Measurement, arm_error, height_error, stumbles, torso_error, velocity_error
-from lowlevel.rotations import rotate_about_vertical
+from lowlevel.runs.checks import NonFiniteError
+from lowlevel.world.measures import Measurement, arm_error, height_error, stumbles, torso_error, velocity_error
 from robots.g1.constants import EFFORT, joint_index
+from robots.rotations import rotate_about_vertical
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Transition:
 
     @cached_property
     def torso_error(self) -> Tensor:
-        """As :func:`lowlevel.measures.torso_error` has it (N, 3) [rad]."""
+        """As :func:`lowlevel.world.measures.torso_error` has it (N, 3) [rad]."""
         return torso_error(self.measured, self.command)
 
 

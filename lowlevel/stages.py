@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 
 from lowlevel.commands import PROTOCOL, Mixture
 from lowlevel.environment import EnvironmentConfig
-from lowlevel.randomization import RandomizationConfig
 from lowlevel.rewards import RewardWeights
-from lowlevel.terrain import TerrainConfig
+from lowlevel.world.randomization import RandomizationConfig
+from lowlevel.world.terrain import TerrainConfig
 
 
 @dataclass(frozen=True)

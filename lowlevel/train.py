@@ -12,12 +12,12 @@ from typing import Annotated
 import torch
 import tyro
 
-from lowlevel import distributed
-from lowlevel.checks import require_finite
-from lowlevel.command_line import command_line
 from lowlevel.export import export_controller
 from lowlevel.presets import PRESETS
-from lowlevel.provenance import (
+from lowlevel.runs import distributed
+from lowlevel.runs.checks import require_finite
+from lowlevel.runs.command_line import command_line
+from lowlevel.runs.provenance import (
     describe_run,
     find_state,
     make_run_folder,

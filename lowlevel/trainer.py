@@ -15,16 +15,8 @@ import tyro
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from lowlevel.absorption import AbsorptionConfig, absorb_prior
 from lowlevel.commands import shares
-from lowlevel.curriculum import Curriculum, CurriculumConfig
-from lowlevel.distributed import any_rank, average_over_ranks, rank, world_size
-from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
-from lowlevel.files import atomic_write
-from lowlevel.interrupts import stop_on_signals
-from lowlevel.measures import TRACKING_FIGURES
-from lowlevel.networks import NetworkConfig, ObservationSizes
-from lowlevel.observation import (
+from lowlevel.control.observation import (
     FRAME,
     FRAME_SIZE,
     HISTORY_LENGTH,
@@ -33,11 +25,20 @@ from lowlevel.observation import (
     PRIVILEGED_SIZE,
     normalised_columns,
 )
-from lowlevel.ppo import PPO, PPOConfig
-from lowlevel.progress import ProgressReport
+from lowlevel.curriculum import Curriculum, CurriculumConfig
+from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
+from lowlevel.gait_prior import first_stride
+from lowlevel.learning.absorption import AbsorptionConfig, absorb_prior
+from lowlevel.learning.ppo import PPO, PPOConfig
+from lowlevel.networks.actor import NetworkConfig, ObservationSizes
+from lowlevel.runs.distributed import any_rank, average_over_ranks, rank, world_size
+from lowlevel.runs.files import atomic_write
+from lowlevel.runs.interrupts import stop_on_signals
+from lowlevel.runs.progress import ProgressReport
+from lowlevel.runs.training_log import LOG_FILE, drop_entries_after, write_entry
 from lowlevel.stages import Stage
-from lowlevel.terrain import MAP_SIZE
-from lowlevel.training_log import LOG_FILE, drop_entries_after, write_entry
+from lowlevel.world.measures import TRACKING_FIGURES
+from lowlevel.world.terrain import MAP_SIZE
 from robots.errors import PilotError
 from robots.g1.constants import LOWER_JOINTS, NUM_JOINTS
 
@@ -120,6 +121,7 @@ class Trainer:
         self.trained_seconds = 0.0
         self.fall_rate = 0.05
         self.observation: dict[str, Tensor] = {}
+        self.stride = first_stride(config.environment.prior)
         self._stop_requested = False
         self._begin_stage(0)
 
@@ -133,6 +135,7 @@ class Trainer:
         stage = self.stage
         seed = self.config.seed + 7919 * rank() + 104729 * number
         self.environment = PilotEnvironment(stage.environment(self.config.environment), seed=seed, device="cpu")
+        self.environment.prior.stride = self.stride
         self._shares = shares(stage.mixture)
         acting = NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop
         self.ppo.enter(stage.std, acting, stage.rollout_doublings)
@@ -223,10 +226,16 @@ class Trainer:
         steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
         self.curriculum.update()
         self._apply_curriculum()
+        if self.stage.gait_prior > 0.0:
+            self.environment.prior.fit()
+            self.stride = self.environment.prior.stride
         figures = {f"reward/{name}": value for name, value in mean_terms.items()}
         figures |= {f"tracking/{name}": value for name, value in tracking.take().items()}
         figures |= {f"curriculum/{name}": value for name, value in self.curriculum.figures(self._shares).items()}
         figures["curriculum/stage"] = float(self.stage_number)
+        if self.stage.gait_prior > 0.0:
+            strides = zip(("forwards", "sideways", "turning"), self.stride.diagonal().tolist(), strict=True)
+            figures |= {f"prior/{name}": stride for name, stride in strides}
         figures |= {f"learner/{name}": value for name, value in losses.items()}
         figures["episode/steps_between_falls"] = steps_between_falls
         figures["speed/collection_seconds"] = collection_seconds
@@ -244,6 +253,7 @@ class Trainer:
             "steps": self.steps,
             "trained_seconds": self.trained_seconds,
             "fall_rate": self.fall_rate,
+            "stride": self.stride,
             "action_scale": self.environment.action_scale.cpu(),
             "stage": self.stage_number,
             "stage_begin": self.stage_begin,
@@ -279,6 +289,7 @@ class Trainer:
         self.curriculum.load_state_dict(state["curriculum"])
         self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
         self.fall_rate = float(state["fall_rate"])
+        self.stride = state["stride"]
         self._begin_stage(int(state["stage"]))
         self.stage_begin, self.waited_for = int(state["stage_begin"]), float(state["waited_for"])
         if with_environment and rank() == 0 and "environment" in state:

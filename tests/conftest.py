@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from evaluation.pictures import NoOpenGLError, find_platform
+from evaluation.pictures.painter import NoOpenGLError, find_platform
 from lowlevel.commands import command_space
-from lowlevel.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
-from lowlevel.networks import NetworkConfig, PilotActor
-from lowlevel.observation import FRAME, normalised_columns
-from lowlevel.reference import ReferenceConfig
+from lowlevel.control.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
+from lowlevel.control.observation import FRAME, normalised_columns
+from lowlevel.control.reference import ReferenceConfig
+from lowlevel.networks.actor import NetworkConfig, PilotActor
 from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
 from robots.g1.model import build_spec, joint_limits
 from robots.g1.nominal_pose import NominalPose

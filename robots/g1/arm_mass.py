@@ -8,7 +8,7 @@ from torch import Tensor
 
 from robots.g1.constants import ARM_JOINTS
 from robots.g1.kinematics import build_model
-from robots.g1.turns import blend, turn_basis
+from robots.turns import blend, turn_basis
 
 _ARM_LENGTH = 7
 """Joints of one arm, from the shoulder outwards."""

@@ -13,10 +13,10 @@ import pinocchio as pin
 import torch
 from torch import Tensor
 
-from lowlevel.rotations import rotation_vector
 from robots.g1.constants import ARM_JOINTS, JOINT_NAMES, PELVIS_BODY, SIDES, WAIST_JOINTS
 from robots.g1.kinematics import PALM_FRAMES, build_model
-from robots.g1.turns import blend, turn_basis
+from robots.rotations import rotation_vector
+from robots.turns import blend, turn_basis
 
 _WAIST_SIZE, _ARM_SIZE = 3, 7
 

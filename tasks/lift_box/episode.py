@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from highlevel.draws import uniform
 from highlevel.task import Start
+from lowlevel.runs.draws import uniform
 from tasks.lift_box.config import LiftBoxConfig
 
 _SPAWN_STREAM = 1

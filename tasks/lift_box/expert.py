@@ -14,8 +14,10 @@ from torch import Tensor
 from highlevel.environment import CommandEnvironment
 from highlevel.task import rows
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
-from lowlevel.measures import Measurement
-from lowlevel.rotations import (
+from lowlevel.world.measures import Measurement
+from robots.g1.constants import ARM_JOINTS, PALM_HALF_THICKNESS, SOLE_CENTER, WAIST_JOINTS
+from robots.g1.mirror import both_arms
+from robots.rotations import (
     conjugate,
     from_roll_pitch_yaw,
     multiply,
@@ -24,8 +26,6 @@ from lowlevel.rotations import (
     rotate_inverse,
     yaw_of,
 )
-from robots.g1.constants import ARM_JOINTS, PALM_HALF_THICKNESS, SOLE_CENTER, WAIST_JOINTS
-from robots.g1.mirror import both_arms
 from tasks.lift_box.arms import ArmKinematics, palm_rotation
 from tasks.lift_box.expert_config import CLOSE, DESCEND, HOLD, LIFT, STOP, WALK, ExpertConfig
 from tasks.lift_box.geometry import Situation

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lowlevel.measures import Measurement
-from lowlevel.rotations import conjugate, multiply, rotate, rotate_about_vertical, rotate_inverse, yaw_of
+from lowlevel.world.measures import Measurement
+from robots.rotations import conjugate, multiply, rotate, rotate_about_vertical, rotate_inverse, yaw_of
 
 
 def relative_pose(frame: Tensor, thing: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from lowlevel.simulation import BatchSimulation
+from lowlevel.world.simulation import BatchSimulation
 from robots.g1.constants import HAND_BODIES, SIDES, TORSO_BODY
 from robots.g1.model import PALM_COLLISION, WORLD_COLLISION
 

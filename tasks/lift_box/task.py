@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from highlevel.action import ActionConfig
-from highlevel.draws import uniform
 from highlevel.task import Decision, ObservationBlock, Outcome, Start, Task, rows
-from lowlevel.measures import Measurement
-from lowlevel.rotations import from_roll_pitch_yaw, multiply, rotate
-from lowlevel.simulation import BatchSimulation
+from lowlevel.runs.draws import uniform
+from lowlevel.world.measures import Measurement
+from lowlevel.world.simulation import BatchSimulation
+from robots.rotations import from_roll_pitch_yaw, multiply, rotate
 from tasks.lift_box.config import LiftBoxConfig
 from tasks.lift_box.episode import Episode, draw
 from tasks.lift_box.geometry import Situation, observe_situation, relative_pose, rotation_6d

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from evaluation.baseline import PlainMujocoEnv
 from evaluation.benchmark import main
-from evaluation.speed import measure_environment, measure_latency, window_rates
+from evaluation.protocols.plain_env import PlainMujocoEnv
+from evaluation.protocols.speed import measure_environment, measure_latency, window_rates
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 
 
@@ -25,7 +25,7 @@ def test_rates_count_work_per_second() -> None:
 
 
 def test_the_shares_of_an_environment_step_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evaluation.speed.WINDOWS", 1)
+    monkeypatch.setattr("evaluation.protocols.speed.WINDOWS", 1)
     standing = EnvironmentConfig(num_robots=8, num_threads=1, start_moving=0.0, mixture=(("stand", 1.0),))
     environment = PilotEnvironment(standing)  # nobody falls: resets would count as neither physics nor Python
     environment.reset()

@@ -18,7 +18,7 @@ from evaluation.highlevel import (
     success_figures,
     with_control,
 )
-from evaluation.statistics import wilson_interval
+from evaluation.reporting.statistics import wilson_interval
 from highlevel.episodes import EpisodeRecord
 from highlevel.task import load_task
 

@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from evaluation.harness import Arena, Episode, Push
 from evaluation.lowlevel import main
-from evaluation.skills import BARS
-from evaluation.statistics import wilson_interval
-from evaluation.tracking import (
+from evaluation.protocols.arena import Arena, Episode, Push
+from evaluation.protocols.skills import BARS
+from evaluation.protocols.tracking import (
     FIGURES,
     GROUPS,
     energy_per_metre,
@@ -34,9 +33,10 @@ from evaluation.tracking import (
     tracking_figures,
     walking_episodes,
 )
-from lowlevel.controller import ONNX_FILE, Controller
-from lowlevel.measures import TRACKING_FIGURES
-from lowlevel.terrain import TerrainConfig
+from evaluation.reporting.statistics import wilson_interval
+from lowlevel.control.controller import ONNX_FILE, Controller
+from lowlevel.world.measures import TRACKING_FIGURES
+from lowlevel.world.terrain import TerrainConfig
 from robots.g1.constants import ARM_JOINTS
 
 FLAT = TerrainConfig(tile_size=16.0)
@@ -149,7 +149,7 @@ def test_figures_are_means_over_episodes_of_their_commands(arena: Arena, control
 
 def test_steady_errors_begin_two_seconds_after_a_change(arena: Arena, controller: Controller) -> None:
     """With a transient of 0.1 s the steady mean is the mean over the other steps."""
-    import evaluation.tracking as tracking
+    import evaluation.protocols.tracking as tracking
 
     episodes = two_commands(controller)[1:2]
     moments = list(arena.run(episodes))
@@ -204,7 +204,7 @@ def test_walking_counts_falls_and_speed(arena: Arena, controller: Controller) ->
 
 
 def test_activations_are_averaged_by_mode(arena: Arena, controller: Controller) -> None:
-    import evaluation.tracking as tracking
+    import evaluation.protocols.tracking as tracking
 
     space = controller.config.command_space
     lower, upper = space.bounds()
@@ -237,7 +237,7 @@ def test_command_writes_a_report(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("evaluation.tracking.MODE_EPISODES", 1)
+    monkeypatch.setattr("evaluation.protocols.tracking.MODE_EPISODES", 1)
     folder = tmp_path / "controller"
     shutil.copytree(untrained_controller, folder)
     output = tmp_path / "results" / "report"

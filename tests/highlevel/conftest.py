@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from highlevel.demonstrations import Source
 from highlevel.environment import ROBOT_BLOCKS, CommandEnvironment, PhysicsConfig
+from highlevel.learning.config import PPOConfig
+from highlevel.learning.demonstrations import Source
 from highlevel.task import load_task
-from highlevel.training_config import PPOConfig
 
 
 @pytest.fixture

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from highlevel.environment import CommandEnvironment, PhysicsConfig, StepResult
 from highlevel.task import Decision, Outcome, load_task
-from lowlevel.checks import NonFiniteError
 from lowlevel.commands import HEIGHT
-from lowlevel.controller import Controller
-from lowlevel.measures import Measurement
+from lowlevel.control.controller import Controller
+from lowlevel.runs.checks import NonFiniteError
+from lowlevel.world.measures import Measurement
 
 Make = Callable[..., CommandEnvironment]
 

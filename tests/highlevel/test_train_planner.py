@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from highlevel.cloning import CloningConfig
-from highlevel.demonstrations import Demonstrations, Source
 from highlevel.environment import CommandEnvironment, PhysicsConfig
+from highlevel.learning.cloning import CloningConfig
+from highlevel.learning.config import PlannerTrainingConfig, PPOConfig
+from highlevel.learning.demonstrations import Demonstrations, Source
+from highlevel.learning.policy import PlannerNetwork
 from highlevel.planner import Planner
-from highlevel.policy import PlannerNetwork
 from highlevel.run_folder import BEST_FOLDER, LOG_FILE, STATE_FILE, read_config
 from highlevel.train import main
 from highlevel.trainer import DEMONSTRATION_SEED, TRAINING_SEED, PlannerTrainer
-from highlevel.training_config import PlannerTrainingConfig, PPOConfig
-from lowlevel.checks import NonFiniteError
+from lowlevel.runs.checks import NonFiniteError
 
 _TINY = [
     "--demonstrations=0",

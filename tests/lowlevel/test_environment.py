@@ -9,11 +9,8 @@ import torch
 
 from lowlevel import rewards
 from lowlevel.commands import HEIGHT, KINDS
-from lowlevel.controller import Controller, Proprioception
-from lowlevel.environment import EnvironmentConfig, PilotEnvironment
-from lowlevel.export import export_controller
-from lowlevel.measures import TRACKING_FIGURES, measure
-from lowlevel.observation import (
+from lowlevel.control.controller import Controller, Proprioception
+from lowlevel.control.observation import (
     FRAME,
     FRAME_SIZE,
     HISTORY_LENGTH,
@@ -22,12 +19,15 @@ from lowlevel.observation import (
     NoiseConfig,
     split_frame,
 )
-from lowlevel.ppo import PPOConfig
-from lowlevel.randomization import RandomizationConfig
+from lowlevel.environment import EnvironmentConfig, PilotEnvironment
+from lowlevel.export import export_controller
+from lowlevel.learning.ppo import PPOConfig
 from lowlevel.rewards import REWARD_TERMS, RewardWeights
 from lowlevel.stages import Stage
-from lowlevel.terrain import TerrainConfig
 from lowlevel.trainer import Trainer, TrainingConfig
+from lowlevel.world.measures import TRACKING_FIGURES, measure
+from lowlevel.world.randomization import RandomizationConfig
+from lowlevel.world.terrain import TerrainConfig
 
 SMALL = EnvironmentConfig(num_robots=6, num_threads=1)
 QUIET = replace(

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lowlevel.checks import NonFiniteError
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
-from lowlevel.measures import Measurement, has_fallen, is_lost, measure, stumbles, torso_error
 from lowlevel.rewards import REWARD_TERMS, RewardWeights, Transition, compute_rewards
-from lowlevel.rotations import from_roll_pitch_yaw
+from lowlevel.runs.checks import NonFiniteError
+from lowlevel.world.measures import Measurement, has_fallen, is_lost, measure, stumbles, torso_error
+from robots.rotations import from_roll_pitch_yaw
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_feet_are_to_be_where_the_told_velocity_needs_them(standing: Transition)
     walking = torch.ones(4, dtype=torch.bool)
     landing = replace(standing, command=command, phase=torch.full((4,), torch.pi), walking=walking)
     right = torch.tensor([[1.0, 1.0, 0.0]]).repeat(4, 1)
-    left = right + torch.tensor([[0.2, 0.24, 0.0], [0.1, 0.24, 0.0], [0.2, 0.34, 0.0], [-0.2, 0.24, 0.0]])
+    left = right + torch.tensor([[0.2, 0.18, 0.0], [0.1, 0.18, 0.0], [0.2, 0.28, 0.0], [-0.2, 0.18, 0.0]])
     placed = moved(landing, foot_position=torch.stack([left, right], dim=1), heading=torch.zeros(4))
     squares = [0.0, 0.01, 0.01, 0.16]
     assert term("foot_placement", placed) == pytest.approx([2.718281828 ** (-s / 0.02) for s in squares], rel=1e-4)

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from lowlevel.controller import Controller
+from lowlevel.control.controller import Controller
 from lowlevel.environment import EnvironmentConfig
 from lowlevel.export import export_run
-from lowlevel.network_config import NetworkConfig
-from lowlevel.plain import from_plain
+from lowlevel.networks.config import NetworkConfig
 from lowlevel.presets import PRESETS
-from lowlevel.provenance import (
+from lowlevel.runs.configs import from_plain
+from lowlevel.runs.provenance import (
     describe_run,
     make_run_folder,
     read_run_description,
@@ -26,9 +26,9 @@ from lowlevel.provenance import (
     require_unused,
     write_run_description,
 )
+from lowlevel.runs.training_log import LOG_FILE
 from lowlevel.train import main
 from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig
-from lowlevel.training_log import LOG_FILE
 from robots.errors import PilotError
 
 TINY_NETWORK = NetworkConfig(

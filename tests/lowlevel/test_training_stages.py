@@ -9,16 +9,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from lowlevel.absorption import AbsorptionConfig, absorb_prior
 from lowlevel.commands import KINDS
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
-from lowlevel.network_config import NetworkConfig
-from lowlevel.ppo import PPOConfig
+from lowlevel.learning.absorption import AbsorptionConfig, absorb_prior
+from lowlevel.learning.ppo import PPOConfig
+from lowlevel.networks.config import NetworkConfig
 from lowlevel.presets import PRESETS
-from lowlevel.randomization import RandomizationConfig
 from lowlevel.rewards import RewardWeights
 from lowlevel.stages import Stage
 from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig
+from lowlevel.world.randomization import RandomizationConfig
 
 QUICK = AbsorptionConfig(rounds=2, steps=4, mixed_rounds=1, gradient_steps=2, minibatch=16)
 FIRST = Stage("first", "reward/alive", above=0.1, least_steps=0, std=(0.2, 0.3), gait_prior=1.0)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from lowlevel.terrain import Terrain, TerrainConfig
+from lowlevel.world.terrain import Terrain, TerrainConfig
 from robots.g1.constants import GAINS, LOWER_JOINTS, SIDES
 from robots.g1.model import ModelOptions, build_spec
 from robots.g1.nominal_pose import NominalPose

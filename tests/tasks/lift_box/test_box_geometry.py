@@ -7,10 +7,10 @@ import pinocchio as pin
 import torch
 from torch import Tensor
 
-from lowlevel.measures import Measurement
-from lowlevel.rotations import from_roll_pitch_yaw
-from lowlevel.simulation import RobotState
+from lowlevel.world.measures import Measurement
+from lowlevel.world.simulation import RobotState
 from robots.g1.kinematics import placement, pose_in_pelvis
+from robots.rotations import from_roll_pitch_yaw
 from tasks.lift_box.geometry import observe_situation, relative_pose, rotation_6d
 
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from highlevel.environment import CommandEnvironment, PhysicsConfig
-from lowlevel.rotations import yaw_of
 from robots.g1.constants import HAND_BODIES
+from robots.rotations import yaw_of
 from tasks.lift_box.config import LiftBoxConfig, NoiseConfig, PushConfig, SpawnConfig
 from tasks.lift_box.episode import draw
 from tasks.lift_box.geometry import relative_pose

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.policies import SCRIPTED, make_policy
+from evaluation.protocols.policies import SCRIPTED, make_policy
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.episodes import run_episodes
 from highlevel.registration import find_controller

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from highlevel.action import ActionConfig
-from highlevel.draws import uniform
 from highlevel.task import Decision, ObservationBlock, Outcome, Start, Task
 from lowlevel.commands import HEIGHT
-from lowlevel.measures import Measurement
-from lowlevel.simulation import BatchSimulation
+from lowlevel.runs.draws import uniform
+from lowlevel.world.measures import Measurement
+from lowlevel.world.simulation import BatchSimulation
 
 TOLERANCE = 0.03
 """Largest distance from the wanted height that counts as reached [m]."""

@@ -1,0 +1,1 @@
+"""What is measured, and how: robots through scripted episodes, speed, success rates."""

@@ -1,0 +1,385 @@
+"""Runs a frozen controller through scripted episodes and hands out every control step.
+
+An episode is fixed by its seed and its command schedule alone. Friction, start and observation noise come
+from the episode's own generator, and every batch has the same number of rows, so that an episode's outcome
+depends neither on how many others are evaluated nor on which ones. Every command counts: a robot that falls lies
+there until its next command begins, and is stood up for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lowlevel.commands import COMMAND_SIZE, HEIGHT, POSTURE
+from lowlevel.control.controller import Controller, Proprioception
+from lowlevel.control.observation import NoiseConfig
+from lowlevel.environment import MAP_REFRESH_STEPS
+from lowlevel.world.measures import Measurement, has_fallen, measure
+from lowlevel.world.randomization import RandomizationConfig, Randomizer
+from lowlevel.world.simulation import BatchSimulation
+from lowlevel.world.terrain import MAP_SIZE, Terrain, TerrainConfig
+from robots.errors import PilotError
+from robots.g1.constants import DEFAULT_POSITION, LOWER_JOINTS, NUM_JOINTS, joint_index
+from robots.g1.model import ModelOptions, build_spec
+from robots.rotations import from_roll_pitch_yaw
+
+BATCH = 32
+"""Robots side by side. The last digits of a matrix product, and with them a fall, depend on its row count."""
+TIMESTEP, DECIMATION = 0.002, 10
+"""Physics step [s] and physics steps per control step of the evaluation protocol."""
+START_SPREAD = 1.0
+"""Largest distance of a start from its tile's centre, per axis [m]."""
+JOINT_SPREAD = 0.02
+"""Largest deviation of a joint from the standing pose at the start [rad]."""
+_PROPRIOCEPTION_SIZE = 2 * NUM_JOINTS + 6
+
+
+@dataclass(frozen=True)
+class Push:
+    """A sudden change of the pelvis's velocity."""
+
+    time: float
+    """[s]"""
+    velocity_change: tuple[float, float, float]
+    """World frame [m/s]."""
+
+
+@dataclass(frozen=True)
+class HandLoad:
+    """What a box squeezed between the palms does to the hands: it pushes them apart and hangs from them."""
+
+    outward: float
+    """Force on each hand along the line between the palms, away from the other hand [N]."""
+    downward: float
+    """Force on each hand [N]."""
+    begin: float = 0.0
+    """When it sets in, for the rest of the episode [s]."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What happens to one robot: it starts standing at rest and is given piecewise constant commands."""
+
+    seed: int
+    """Seed of friction, start and noise."""
+    duration: float
+    """[s]"""
+    starts: tuple[float, ...]
+    """When each command begins [s], ascending, the first at 0."""
+    commands: Tensor
+    """(len(starts), 21); the controller clamps them."""
+    flags: Tensor
+    """Tracking flag I of each command (len(starts),)."""
+    tile: int = 0
+    """Index of the terrain tile to start on."""
+    pushes: tuple[Push, ...] = ()
+    load: HandLoad | None = None
+    stands_up: bool = True
+    """Whether a robot that has fallen is stood up for its next command."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One control step of a batch of N rows; rows where ``active`` is false mean nothing."""
+
+    step: int
+    """Control steps before this one."""
+    measured: Measurement
+    """At the end of the step."""
+    targets: Tensor
+    """PD targets of the step (N, 29) [rad]."""
+    command: Tensor
+    """The clamped command that the step tracked (N, 21)."""
+    flag: Tensor
+    """(N, 1)"""
+    since_change: Tensor
+    """Time from the command's begin to the end of the step (N,) [s]."""
+    elevation: Tensor
+    """The noisy elevation map that the controller saw (N, 121) [m]."""
+    gate: Tensor
+    """Expert activations (N, experts)."""
+    work: Tensor
+    """Of all motors in the step, both signs counted positive (N,) [J]."""
+    number: Tensor
+    """Which command of its episode is tracked (N,)."""
+    active: Tensor
+    """Robots that were up when the step began, in episodes that were running (N,)."""
+    fell: Tensor
+    """Active robots that fell in this step (N,)."""
+    failed: Tensor
+    """Active robots whose controller gave targets that are not finite (N,); they are out like those that fell."""
+
+
+def episode_seeds(seed: int, index: int) -> tuple[int, int]:
+    """Two independent seeds for episode ``index`` of an evaluation: for its commands and for its world."""
+    commands, world = np.random.SeedSequence([seed, index]).generate_state(2)
+    return int(commands), int(world)
+
+
+def constant(seed: int, duration: float, command: Tensor, flag: float, tile: int = 0) -> Episode:
+    """An episode with one ``command`` (21,) throughout."""
+    return Episode(seed, duration, (0.0,), command[None], torch.tensor([flag]), tile)
+
+
+def hand_forces(palm_position: Tensor, outward: Tensor, downward: Tensor) -> Tensor:
+    """Forces on left and right hand (N, 2, 3) [N], world frame.
+
+    ``palm_position`` (N, 2, 3) [m]; ``outward`` (N,) along the line between the palms and ``downward`` (N,) are
+    per hand [N].
+    """
+    across = palm_position[:, 0] - palm_position[:, 1]
+    to_the_left = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-3)
+    force = torch.stack([to_the_left, -to_the_left], dim=1) * outward[:, None, None]
+    force[..., 2] -= downward[:, None]
+    return force
+
+
+class Arena:
+    """One controller on one terrain.
+
+    Args:
+        controller: on the CPU; its memory is reset by every batch.
+        terrain: tiles to start on.
+        conditions: friction, latency, gains and torque limits; the protocol's by default.
+        noise: observation noise.
+        num_threads: physics threads.
+        batch: robots simulated side by side (N).
+
+    Raises:
+        PilotError: if the controller runs at another rate.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        terrain: TerrainConfig,
+        conditions: RandomizationConfig | None = None,
+        noise: NoiseConfig = NoiseConfig(),  # noqa: B008 (frozen)
+        num_threads: int = 2,
+        batch: int = BATCH,
+    ) -> None:
+        self.controller = controller
+        self.batch = batch
+        self.terrain = Terrain(terrain)
+        spec = build_spec(ModelOptions(gains=controller.gains, timestep=TIMESTEP))
+        self.terrain.add_to(spec)
+        self.simulation = BatchSimulation(spec.compile(), batch, DECIMATION, num_threads)
+        self.period = self.simulation.control_period
+        expected = controller.config.control_period
+        if abs(self.period - expected) > 1e-9:
+            raise PilotError(f"the controller runs every {expected} s, the evaluation every {self.period} s")
+        drawn = RandomizationConfig.for_evaluation() if conditions is None else conditions
+        self._randomizer = Randomizer(drawn, self.simulation, torch.Generator())
+        self._proprioception_noise = noise.frame_amplitude()
+        self._elevation_noise = noise.elevation
+
+    @property
+    def friction(self) -> Tensor:
+        """Sliding friction of the feet that was drawn for each row (N,)."""
+        return self._randomizer.state.friction[:, 0]
+
+    def run(self, episodes: Sequence[Episode]) -> Iterator[Moment]:
+        """Yield the control steps of up to ``batch`` episodes until all are over; row i is episode i.
+
+        The simulation's state after the step can be read from :attr:`simulation` between two moments.
+        """
+        if not 1 <= len(episodes) <= self.batch:
+            raise ValueError(f"a batch takes 1 to {self.batch} episodes, not {len(episodes)}")
+        rows = torch.arange(self.batch)
+        lengths = torch.zeros(self.batch, dtype=torch.long)
+        lengths[: len(episodes)] = torch.tensor([self._steps(episode.duration) for episode in episodes])
+        stands_up = torch.zeros(self.batch, dtype=torch.bool)
+        stands_up[: len(episodes)] = torch.tensor([episode.stands_up for episode in episodes])
+        starts, commands, flags = self._schedules(episodes)
+        pushes = self._pushes(episodes)
+        load_begin, outward, downward = self._loads(episodes)
+        frame_noise, map_noise, starting = self._start(episodes)
+        self.controller.reset(self.batch)
+        up = torch.ones(self.batch, dtype=torch.bool)
+        measured = measure(self.simulation.read(), self.terrain)
+        elevation = torch.zeros(self.batch, MAP_SIZE)
+        for step in range(int(lengths.max())):
+            current = (starts <= step).sum(dim=1) - 1
+            rising = torch.nonzero(~up & stands_up & (starts[rows, current] == step) & (step < lengths))[:, 0]
+            if len(rising):
+                self._stand(rising, *(values[rising] for values in starting))
+                self.controller.reset(self.batch, rising)
+                up[rising] = True
+                measured = measure(self.simulation.read(), self.terrain)
+            active = up & (step < lengths)
+            waiting = stands_up & ((starts > step) & (starts < lengths[:, None])).any(dim=1) & (step < lengths)
+            if not (active | waiting).any():
+                return
+            command, flag = commands[rows, current], flags[rows, current]
+            seeing = rows if step % MAP_REFRESH_STEPS == 0 else rising
+            if len(seeing):
+                ground = self.terrain.elevation_map(measured.robot.base_position, measured.heading)
+                elevation[seeing] = (ground + map_noise[step // MAP_REFRESH_STEPS])[seeing]
+            proprioception = _proprioception(measured, frame_noise[step])
+            targets = self.controller.act(proprioception, elevation, command, flag)
+            failed = active & ~torch.isfinite(targets).all(dim=1)
+            if step in pushes:
+                self.simulation.push(pushes[step])
+            bears = load_begin <= step
+            if bears.any():
+                palms = measured.robot.palm_position
+                self.simulation.set_hand_force(hand_forces(palms, bears * outward, bears * downward))
+            moving = torch.nonzero(active & ~failed)[:, 0]
+            applied = self._randomizer.delayed(torch.nan_to_num(targets))
+            work = self.simulation.step_with_work(applied, moving)
+            measured = measure(self.simulation.read(), self.terrain)
+            fell = active & ~failed & (has_fallen(measured) | self.simulation.diverged())
+            yield Moment(
+                step=step,
+                measured=measured,
+                targets=targets,
+                command=command,
+                flag=flag,
+                since_change=(step + 1 - starts[rows, current]) * self.period,
+                elevation=elevation.clone(),
+                gate=self.controller.gate,
+                work=work,
+                number=current,
+                active=active,
+                fell=fell,
+                failed=failed,
+            )
+            up = up & ~fell & ~failed
+
+    # -- preparing a batch -----------------------------------------------------------------------------------
+
+    def _steps(self, seconds: float) -> int:
+        return round(seconds / self.period)
+
+    def _schedules(self, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor, Tensor]:
+        """First step (N, S), clamped command (N, S, 21) and flag (N, S, 1) of every command."""
+        most = max(len(episode.starts) for episode in episodes)
+        starts = torch.full((self.batch, most), torch.iinfo(torch.long).max)
+        starts[:, 0] = 0
+        commands = self.controller.config.command_space.neutral().repeat(self.batch, most, 1)
+        flags = torch.ones(self.batch, most, 1)
+        for row, episode in enumerate(episodes):
+            count = len(episode.starts)
+            starts[row, :count] = torch.tensor([self._steps(start) for start in episode.starts])
+            commands[row, :count] = episode.commands
+            flags[row, :count, 0] = episode.flags
+        clamped = self.controller.clamp_command(commands.flatten(0, 1))
+        return starts, clamped.reshape(self.batch, most, COMMAND_SIZE), flags
+
+    def _pushes(self, episodes: Sequence[Episode]) -> dict[int, Tensor]:
+        """Velocity changes (N, 3) by control step."""
+        pushes: dict[int, Tensor] = {}
+        for row, episode in enumerate(episodes):
+            for push in episode.pushes:
+                change = pushes.setdefault(self._steps(push.time), torch.zeros(self.batch, 3))
+                change[row] += torch.tensor(push.velocity_change)
+        return pushes
+
+    def _loads(self, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor, Tensor]:
+        """First step with a load (N,), and its outward and downward force per hand (N,) [N]."""
+        begin = torch.full((self.batch,), torch.iinfo(torch.long).max)
+        outward, downward = torch.zeros(self.batch), torch.zeros(self.batch)
+        for row, episode in enumerate(episodes):
+            if episode.load is not None:
+                begin[row] = self._steps(episode.load.begin)
+                outward[row], downward[row] = episode.load.outward, episode.load.downward
+        return begin, outward, downward
+
+    def _start(self, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
+        """Draw everything random and put all robots on their feet.
+
+        Returns:
+            noise of the proprioception (steps, N, 64) and of the elevation map (refreshes, N, 121), and where and how
+            each robot stands: xy (N, 2) [m], heading (N,) [rad], deviation of its joints (N, 29) [rad].
+        """
+        steps = max(self._steps(episode.duration) for episode in episodes)
+        refreshes = -(-steps // MAP_REFRESH_STEPS)
+        frame_noise = torch.zeros(steps, self.batch, _PROPRIOCEPTION_SIZE)
+        map_noise = torch.zeros(refreshes, self.batch, MAP_SIZE)
+        place, joint_spread = torch.zeros(self.batch, 3), torch.zeros(self.batch, NUM_JOINTS)
+        tiles = torch.zeros(self.batch, dtype=torch.long)
+        for row, episode in enumerate(episodes):
+            # Apart from each other, so that conditions that draw more leave place and noise as they are.
+            self._randomizer.generator = torch.Generator().manual_seed(episode.seed)
+            self._randomizer.draw(torch.tensor([row]))
+            generator = torch.Generator().manual_seed(episode.seed + 1)
+            place[row] = _symmetric(generator, 3)
+            joint_spread[row] = JOINT_SPREAD * _symmetric(generator, NUM_JOINTS)
+            # Drawn step by step, so that the noise does not depend on how long the episode lasts.
+            for refresh in range(refreshes):
+                when = slice(refresh * MAP_REFRESH_STEPS, min((refresh + 1) * MAP_REFRESH_STEPS, steps))
+                noise = _symmetric(generator, MAP_REFRESH_STEPS, _PROPRIOCEPTION_SIZE)
+                frame_noise[when, row] = self._proprioception_noise * noise[: when.stop - when.start]
+                map_noise[refresh, row] = self._elevation_noise * _symmetric(generator, MAP_SIZE)
+            tiles[row] = episode.tile
+        starting = self.terrain.tile_centers[tiles] + START_SPREAD * place[:, :2], torch.pi * place[:, 2], joint_spread
+        self._stand(torch.arange(self.batch), *starting)
+        return frame_noise, map_noise, starting
+
+    def _stand(self, ids: Tensor, xy: Tensor, heading: Tensor, joint_spread: Tensor) -> None:
+        """Put robots ``ids`` (n,) at rest in the nominal pose of the neutral command, feet just above the ground."""
+        count = len(ids)
+        zeros = torch.zeros(count)
+        neutral = self.controller.config.command_space.neutral().repeat(count, 1)
+        joints = torch.tensor(DEFAULT_POSITION, dtype=torch.float32).repeat(count, 1)
+        joints[:, LOWER_JOINTS] = self.controller.pose.lookup(neutral[:, POSTURE]).position
+        pelvis_pitch = -joints[:, joint_index("waist_pitch_joint")]
+        orientation = from_roll_pitch_yaw(torch.stack([zeros, pelvis_pitch, heading], -1))
+        on_ground = torch.cat([xy, zeros[:, None]], -1)
+        highest_ground = -self.terrain.elevation_map(on_ground, heading).amin(dim=1)
+        height = highest_ground + neutral[:, HEIGHT] + 0.005
+        position = torch.cat([xy, height[:, None]], -1)
+        self.simulation.reset(ids, position, orientation, joints + joint_spread)
+        self._randomizer.start(ids, joints)
+        self.simulation.forward(ids)
+
+
+def run_all(
+    arena: Arena,
+    episodes: Sequence[Episode],
+    observe: Callable[[int, Sequence[Episode]], Callable[[Moment], None]],
+    advance: Callable[[int], None] = lambda steps: None,
+) -> None:
+    """Run any number of episodes, a batch at a time.
+
+    Args:
+        arena: where.
+        episodes: what.
+        observe: called with the index of a batch's first episode and its episodes; returns what is given
+            every moment.
+        advance: told how many control steps of a batch have passed, for a progress bar.
+    """
+    for first in range(0, len(episodes), arena.batch):
+        batch = episodes[first : first + arena.batch]
+        see = observe(first, batch)
+        steps = 0
+        for moment in arena.run(batch):
+            see(moment)
+            advance(1)
+            steps += 1
+        advance(batch_steps(arena, batch) - steps)
+
+
+def batch_steps(arena: Arena, episodes: Sequence[Episode]) -> int:
+    """Control steps that all batches of ``episodes`` take if nobody falls."""
+    size = arena.batch
+    batches = [episodes[first : first + size] for first in range(0, len(episodes), size)]
+    return sum(max(round(episode.duration / arena.period) for episode in batch) for batch in batches)
+
+
+def _symmetric(generator: torch.Generator, *shape: int) -> Tensor:
+    """Uniform numbers in [-1, 1]."""
+    return 2.0 * torch.rand(*shape, generator=generator) - 1.0
+
+
+def _proprioception(measured: Measurement, noise: Tensor) -> Proprioception:
+    """Measurements with ``noise`` (N, 64) added, in the order of the observation frame."""
+    robot = measured.robot
+    base = (robot.base_angular_velocity, measured.projected_gravity)
+    clean = torch.cat([robot.joint_position, robot.joint_velocity, *base], -1)
+    return Proprioception(*(clean + noise).split([NUM_JOINTS, NUM_JOINTS, 3, 3], dim=-1))

@@ -1,0 +1,1 @@
+"""How planners learn: demonstrations, cloning and PPO."""

@@ -1,0 +1,1 @@
+"""What travels to a robot: observation, reference, one control step, the frozen controller."""

@@ -1,0 +1,1 @@
+"""How the networks learn: PPO, the estimator and absorption of the gait prior."""

@@ -1,0 +1,111 @@
+"""Cloning a policy and the gait prior under it into the policy alone.
+
+The prior is a function of what the policy sees (clock and slewed velocity), so the sum of both is a policy, too. The
+student acts in the world without prior, and imitates what teacher and prior would do there (DAgger, Ross et al.,
+AISTATS 2011). A fade of the prior costs speed faster than PPO can take it over; this costs minutes and no skill.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lowlevel.control.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, columns
+from lowlevel.environment import PilotEnvironment
+from lowlevel.learning.ppo import PPO
+from lowlevel.runs.distributed import average_over_ranks
+from robots.g1.constants import NUM_JOINTS
+
+
+@dataclass(frozen=True)
+class AbsorptionConfig:
+    """How long and how fast the student learns."""
+
+    rounds: int = 50
+    """Rounds of acting and learning."""
+    steps: int = 24
+    """Control steps per robot and round."""
+    mixed_rounds: int = 20
+    """Rounds over which the teacher hands over to the student."""
+    kept_rounds: int = 10
+    """Rounds whose samples the student learns from."""
+    gradient_steps: int = 24
+    """Per round."""
+    minibatch: int = 6144
+    """Samples per gradient step."""
+    learning_rate: float = 1e-3
+    """Learning rate; a third of it in the last fifth of the rounds."""
+
+
+@torch.no_grad()
+def _mirrored(ppo: PPO, observation: dict[str, Tensor], label: Tensor) -> tuple[Tensor, ...]:
+    """The mirror image of a sample. An asymmetric clone would spend PPO's first million steps on its mirror loss."""
+    history, elevation = (ppo.mirrors(key, observation[key]) for key in ("history", "elevation_map"))
+    velocity, latent = ppo.actor.encode(history, elevation)
+    frame = history[:, -FRAME_SIZE:].clone()
+    return frame, elevation.clone(), observation["flag"].clone(), velocity, latent, ppo.mirrors("action", label)
+
+
+def absorb_prior(
+    ppo: PPO, environment: PilotEnvironment, weight: float, config: AbsorptionConfig, report: Callable[[str], None]
+) -> dict[str, Tensor]:
+    """Teach the actor of ``ppo`` to act in ``environment``, which has no prior, as it did under ``weight`` of it.
+
+    ``report`` is told how it goes, a line a round. Returns the observation to go on from.
+    """
+    student, robots, frames, device = ppo.actor, environment.num_robots, HISTORY_LENGTH + 1, ppo.device
+    teacher = copy.deepcopy(student).eval().requires_grad_(False)
+    last_action, acting, std = columns(FRAME, "last_action"), ppo.learner.acting, student.log_std.exp().detach()
+    optimizer = torch.optim.Adam(student.policy_parameters(), lr=config.learning_rate)
+    kept: deque[tuple[Tensor, ...]] = deque(maxlen=config.kept_rounds)
+    # What of each remembered action is the prior's: the teacher has never seen it there.
+    offsets = torch.zeros(robots, frames, NUM_JOINTS, device=device)
+    observation = environment.reset(spread_episodes=True)
+    for round_number in range(config.rounds):
+        handing_over = max(0.0, 1.0 - round_number / config.mixed_rounds)
+        if round_number == config.rounds * 4 // 5:
+            optimizer.param_groups[0]["lr"] = config.learning_rate / 3.0
+        samples, falls = [], 0
+        for _ in range(config.steps):
+            seen_now = {name: values.to(device) for name, values in observation.items()}
+            history = seen_now["history"].view(robots, frames, FRAME_SIZE)
+            seen = history.clone()
+            seen[:, :, last_action] -= offsets
+            offset = (weight * environment.prior(environment.buffers.reference) / environment.action_scale).to(device)
+            with torch.no_grad():
+                context = (seen_now["elevation_map"], seen_now["flag"])
+                label = teacher(seen.flatten(1), *context).mean + offset
+                own = student(seen_now["history"], *context)
+            teachers_turn = torch.rand(robots, 1, generator=ppo.generator, device=device) < handing_over
+            noise = 0.5 * std * torch.randn(label.shape, generator=ppo.generator, device=device)
+            action = torch.where(teachers_turn, label, own.mean) + noise
+            samples.append((history[:, -1].clone(), *(c.clone() for c in context), own.velocity, own.latent, label))
+            samples.append(_mirrored(ppo, seen_now, label))
+            result = environment.step(action.cpu())
+            ended = (result.terminated | result.truncated).to(device)
+            falls += int(result.terminated.sum())
+            offsets = torch.cat([offsets[:, 1:], offset[:, None]], dim=1)
+            offsets[ended] = 0.0
+            observation = result.observation
+        kept.append(tuple(torch.cat(column) for column in zip(*samples, strict=True)))
+        *inputs, labels = (torch.cat(column) for column in zip(*kept, strict=True))
+        losses = []
+        for _ in range(config.gradient_steps):
+            index = torch.randint(len(labels), (config.minibatch,), generator=ppo.generator, device=device)
+            mean, _ = student.decide(*(column[index] for column in inputs))
+            loss = 0.5 * ((mean - labels[index]) / std)[:, acting].square().sum(dim=1).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            average_over_ranks([p.grad for p in student.policy_parameters() if p.grad is not None])
+            torch.nn.utils.clip_grad_norm_(student.policy_parameters(), 5.0)
+            optimizer.step()
+            losses.append(float(loss.detach()))
+        between_falls = config.steps * robots / max(falls, 1)
+        divergence = sum(losses) / len(losses)
+        report(f"absorbing the gait prior: {divergence:.3f} nat, falls every {between_falls:.0f} steps")
+    return observation

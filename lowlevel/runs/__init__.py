@@ -1,0 +1,1 @@
+"""Generic machinery of runs: files, configurations, logs, progress, ranks, errors of commands."""

@@ -1,0 +1,1 @@
+"""Robots on ground: physics, terrain, what is measured of them, and what is drawn for each."""

@@ -1,0 +1,226 @@
+"""The frozen controller: golden vectors, ONNX parity, resets, and refusal of bad folders."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from lowlevel.control.control_step import ControlStep
+from lowlevel.control.controller import (
+    CONFIG_FILE,
+    GOLDEN_FILE,
+    ONNX_FILE,
+    WEIGHTS_FILE,
+    Controller,
+    ControllerError,
+    add_metrics,
+    content_hash,
+)
+from lowlevel.control.golden import replay
+from lowlevel.control.onnx_step import FIRST_MEMORY, INPUTS
+from lowlevel.environment import EnvironmentConfig
+from lowlevel.export import export_controller
+from lowlevel.trainer import Trainer, TrainingConfig
+
+SHIPPED = sorted((Path(__file__).parents[2] / "checkpoints" / "lowlevel").glob("*/"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An exported controller with random weights that matter."""
+    path = tmp_path_factory.mktemp("controller")
+    trainer = Trainer(TrainingConfig(environment=EnvironmentConfig(num_robots=6, num_threads=1)), path)
+    weight = trainer.ppo.actor.head.output_weight
+    weight.data += 0.05 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(0))
+    export_controller(trainer, path / "exported")
+    return path / "exported"
+
+
+def golden_steps(folder: Path) -> list[dict[str, torch.Tensor]]:
+    golden = json.loads((folder / GOLDEN_FILE).read_text())
+    return [{name: torch.tensor(value) for name, value in step.items()} for step in golden["steps"]]
+
+
+@pytest.mark.parametrize(
+    ("name", "runtime"), [("exported", "torch"), *((name, "onnx") for name in ("exported", *SHIPPED))]
+)
+def test_golden_vectors_replay(folder: Path, name: str | Path, runtime: Literal["torch", "onnx"]) -> None:
+    path = folder if name == "exported" else Path(name)
+    controller = Controller.load(path, runtime=runtime)
+    controller.reset(4)
+    for step in golden_steps(path):
+        assert torch.allclose(replay(controller, step), step["targets"], atol=1e-5)
+        assert torch.allclose(controller.last_action, step["action"], atol=1e-4)
+
+
+def test_onnx_file_needs_nothing_of_this_package(folder: Path) -> None:
+    """A port feeds measurements and what came out last, by name, for any number of robots."""
+    session = onnxruntime.InferenceSession(folder / ONNX_FILE)
+    first = json.loads(session.get_modelmeta().custom_metadata_map[FIRST_MEMORY])
+    assert len(first) <= 4
+    memory = {name: np.repeat(np.array([value], dtype=np.float32), 4, axis=0) for name, value in first.items()}
+    names = [output.name for output in session.get_outputs()]
+    for step in golden_steps(folder):
+        measured = {name: value.numpy() for name, value in step.items() if name in INPUTS}
+        outputs = dict(zip(names, session.run(names, measured | memory), strict=True))
+        np.testing.assert_allclose(outputs["targets"], step["targets"], atol=1e-5)
+        memory = {name: outputs[f"next_{name}"] for name in memory}
+
+
+def test_a_controller_without_weights_runs_in_onnx_runtime_alone(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    (copy / WEIGHTS_FILE).unlink()
+    description = json.loads((copy / CONFIG_FILE).read_text())
+    del description["policy"]
+    (copy / CONFIG_FILE).write_text(json.dumps(description))
+    Controller.load(copy)
+    with pytest.raises(ControllerError, match="describes no policy for torch: use the runtime 'onnx'"):
+        Controller.load(copy, runtime="torch")
+
+
+def test_an_onnx_file_that_hides_its_first_memory_is_refused(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    model = onnx.load(copy / ONNX_FILE)
+    del model.metadata_props[:]
+    onnx.save(model, copy / ONNX_FILE)
+    with pytest.raises(ControllerError, match="does not say what its first memory is"):
+        Controller.load(copy)
+
+
+def test_unknown_runtimes_are_refused(folder: Path) -> None:
+    with pytest.raises(ControllerError, match="no runtime 'tensorflow'"):
+        Controller.load(folder, runtime="tensorflow")  # type: ignore[arg-type]
+    with pytest.raises(ControllerError, match="on the CPU"):
+        Controller.load(folder, device="meta", runtime="onnx")
+
+
+@pytest.mark.parametrize("keep", [None, 0, 1000])
+def test_missing_or_truncated_onnx_files_are_refused(folder: Path, tmp_path: Path, keep: int | None) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    content = (copy / ONNX_FILE).read_bytes()
+    if keep is None:
+        (copy / ONNX_FILE).unlink()
+    else:
+        (copy / ONNX_FILE).write_bytes(content[:keep])
+    with pytest.raises(ControllerError, match=ONNX_FILE):
+        Controller.load(copy)
+    Controller.load(copy, runtime="torch")
+
+
+def test_resetting_one_robot_forgets_only_that_robot(folder: Path) -> None:
+    steps = golden_steps(folder)
+    controller, fresh = Controller.load(folder), Controller.load(folder)
+    controller.reset(4)
+    fresh.reset(4)
+    for step in steps:
+        replay(controller, step)
+    unbroken = controller.twin(4)
+    for step in steps:
+        replay(unbroken, step)
+    controller.reset(4, torch.tensor([2]))
+    after, first, continued = (replay(c, steps[0]) for c in (controller, fresh, unbroken))
+    assert torch.equal(after[2], first[2])
+    assert torch.equal(after[[0, 1, 3]], continued[[0, 1, 3]])
+    assert not torch.equal(after[0], first[0])
+
+
+def test_acting_leaves_no_gradient_and_no_changed_weight(folder: Path) -> None:
+    controller = Controller.load(folder, runtime="torch")
+    assert isinstance(controller.step, ControlStep)
+    before = {name: tensor.clone() for name, tensor in controller.step.actor.state_dict().items()}
+    controller.reset(4)
+    targets = replay(controller, golden_steps(folder)[0])
+    assert not targets.requires_grad
+    assert all(torch.equal(tensor, before[name]) for name, tensor in controller.step.actor.state_dict().items())
+
+
+def test_wrong_number_of_robots_is_refused(folder: Path) -> None:
+    controller = Controller.load(folder)
+    with pytest.raises(RuntimeError, match=r"reset\(4\)"):
+        replay(controller, golden_steps(folder)[0])
+
+
+def test_metrics_do_not_change_the_identity(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    before = content_hash(copy)
+    add_metrics(copy, {"E_v": 0.1})
+    assert content_hash(copy) == before
+    assert Controller.load(copy).provenance["metrics"] == {"E_v": 0.1}
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+def refused(folder: Path) -> str:
+    with pytest.raises(ControllerError) as error:
+        Controller.load(folder, runtime="torch")
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_empty_folder_is_refused(tmp_path: Path) -> None:
+    assert CONFIG_FILE in refused(tmp_path)
+
+
+def test_missing_weights_are_refused(copy: Path) -> None:
+    (copy / WEIGHTS_FILE).unlink()
+    assert "is missing" in refused(copy)
+
+
+def test_truncated_weights_are_refused(copy: Path) -> None:
+    (copy / WEIGHTS_FILE).write_bytes((copy / WEIGHTS_FILE).read_bytes()[:1000])
+    assert "damaged or truncated" in refused(copy)
+
+
+def test_weights_that_are_not_finite_are_refused_by_name(copy: Path) -> None:
+    tensors = load_file(copy / WEIGHTS_FILE)
+    tensors["head.first.weight"][0, 0] = float("nan")
+    save_file(tensors, copy / WEIGHTS_FILE)
+    assert "'head.first.weight'" in refused(copy)
+
+
+def test_a_controller_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
+    trainer = Trainer(TrainingConfig(environment=EnvironmentConfig(num_robots=6, num_threads=1)), tmp_path)
+    trainer.ppo.actor.head.output_weight.data[0] = float("inf")
+    with pytest.raises(ControllerError, match=r"'head\.output_weight' is not finite"):
+        export_controller(trainer, tmp_path / "broken")
+    assert not (tmp_path / "broken").exists()
+
+
+def test_weights_of_another_network_are_refused(copy: Path) -> None:
+    tensors = load_file(copy / WEIGHTS_FILE)
+    tensors["head.first.weight"] = tensors["head.first.weight"][:, :-1].contiguous()
+    save_file(tensors, copy / WEIGHTS_FILE)
+    assert "does not fit" in refused(copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d | {"format_version": 99}, "format version 99"),
+        (lambda d: d | {"config": {k: v for k, v in d["config"].items() if k != "stiffness"}}, "incomplete"),
+        (
+            lambda d: d | {"config": d["config"] | {"joint_names": d["config"]["joint_names"][::-1]}},
+            "joint order",
+        ),
+    ],
+)
+def test_wrong_descriptions_are_refused(copy: Path, change, message: str) -> None:
+    description = json.loads((copy / CONFIG_FILE).read_text())
+    (copy / CONFIG_FILE).write_text(json.dumps(change(description)))
+    assert message in refused(copy)
+
+
+def test_damaged_json_is_refused(copy: Path) -> None:
+    (copy / CONFIG_FILE).write_text("{")
+    assert "damaged" in refused(copy)

@@ -1,0 +1,157 @@
+"""The reference: slew rates, the gait clock, and joint targets that hold the robot up."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY, CommandSpace, command_space
+from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
+from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
+from robots.g1.constants import GAINS, NUM_JOINTS, WAIST_JOINTS, joint_index
+from robots.g1.mirror import JOINTS_MIRROR
+from robots.g1.model import build_spec, joint_limits
+
+CONFIG = ReferenceConfig()
+
+
+@pytest.fixture(scope="module")
+def reference() -> Reference:
+    return Reference(CONFIG, GAINS["stiff"], control_period=0.02)
+
+
+@pytest.fixture(scope="module")
+def space() -> CommandSpace:
+    limits = joint_limits(build_spec().compile())
+    return command_space(limits[:, 0].tolist(), limits[:, 1].tolist())
+
+
+def test_nothing_moves_faster_than_its_slew_rate_and_all_of_it_arrives(
+    reference: Reference, space: CommandSpace
+) -> None:
+    start = space.neutral()[None]
+    command = reference.clamp(start + torch.tensor([0.8, 0.3, -0.6, -0.2, 0.1, 0.4, -0.5] + [0.4] * 14))
+    state = ReferenceState.standing(start)
+    largest = torch.zeros(1, 21)
+    for _ in range(100):
+        after = reference.advance(state, command)
+        largest = torch.maximum(largest, (after.command - state.command).abs() / 0.02)
+        state = after
+    assert torch.allclose(state.command, command)
+    assert largest[0, VELOCITY].tolist() == pytest.approx([CONFIG.velocity_rate] * 3, rel=1e-3)
+    assert largest[0, HEIGHT].item() == pytest.approx(CONFIG.height_rate, rel=1e-3)
+    assert largest[0, TORSO].tolist() == pytest.approx(CONFIG.torso_rate, rel=1e-3)
+    assert largest[0, ARMS].tolist() == pytest.approx([CONFIG.arm_rate] * 14, rel=1e-3)
+
+
+def test_the_robot_is_told_to_slow_down_more_gently_than_to_speed_up(reference: Reference, space: CommandSpace) -> None:
+    fast = space.neutral()[None]
+    fast[:, VELOCITY] = torch.tensor([0.9, -0.4, 0.6])
+    changes = reference.advance(ReferenceState.standing(fast), space.neutral()[None]).command - fast
+    expected = 0.02 * CONFIG.braking_rate * torch.tensor([-1.0, 1.0, -1.0])
+    torch.testing.assert_close(changes[0, VELOCITY], expected)
+
+
+def test_the_clock_runs_at_its_frequency(reference: Reference, space: CommandSpace) -> None:
+    stand, walk = space.neutral()[None], space.neutral()[None]
+    walk[:, 0] = 0.5
+    state, phases = ReferenceState.standing(stand), []
+    assert not reference.advance(state, stand).walking.any()
+    for _ in range(50):
+        state = reference.advance(state, walk)
+        phases.append(state.phase.item())
+    travelled = np.unwrap(phases)[-1]
+    assert travelled == pytest.approx(2.0 * math.pi * CONFIG.gait_frequency, rel=1e-3)
+
+
+@pytest.mark.parametrize("steps", [20, 30, 40, 47])
+def test_a_robot_told_to_stop_lands_twice_and_may_walk_on_in_between(
+    reference: Reference, space: CommandSpace, steps: int
+) -> None:
+    stand, walk = space.neutral()[None], space.neutral()[None]
+    walk[:, 0] = 0.12  # two steps of the control loop below the speed that counts as walking
+    state = ReferenceState.standing(stand)
+    for _ in range(steps):
+        state = reference.advance(state, walk)
+    while (state.command[:, 0] >= 0.1).any():
+        state = reference.advance(state, stand)
+    begin, stopping = state, []
+    while state.walking.any():
+        stopping.append(reference.clock(state)[0])
+        state = reference.advance(state, stand)
+        assert len(stopping) < 50
+    swings = torch.sign(torch.stack(stopping)[:, 0]).unique_consecutive()
+    assert len(swings) == 2 and (reference.clock(state) == 0.0).all()
+    continued = reference.advance(reference.advance(begin, stand), walk)
+    uninterrupted = reference.advance(reference.advance(begin, walk), walk)
+    torch.testing.assert_close(reference.clock(continued), reference.clock(uninterrupted))
+
+
+def test_a_robot_stops_before_it_squats_and_stands_up_before_it_walks(
+    reference: Reference, space: CommandSpace
+) -> None:
+    walk, squat = space.neutral()[None], space.neutral()[None]
+    walk[:, 0], squat[:, HEIGHT], squat[:, TORSO.start + 1] = 0.6, 0.4, 0.9
+    state = ReferenceState.standing(space.neutral()[None])
+    seen = []
+    for command in (walk, squat, walk):
+        for _ in range(200):
+            state = reference.advance(state, command)
+            deep = state.command[0, HEIGHT] < 0.549 or state.command[0, TORSO.start + 1] > 0.501
+            seen.append((bool(state.walking), bool(deep)))
+        expected = {"walk": (True, False), "squat": (False, True)}["squat" if command is squat else "walk"]
+        assert seen[-1] == expected
+        torch.testing.assert_close(state.command, command)
+    assert (True, True) not in seen
+
+
+def test_the_pelvis_attitude_puts_the_torso_where_it_is_told(reference: Reference, space: CommandSpace) -> None:
+    """Against MuJoCo's kinematics of the whole robot."""
+    model = build_spec().compile()
+    data = mujoco.MjData(model)
+    command = space.neutral().repeat(4, 1)
+    command[:, HEIGHT] = torch.tensor([0.76, 0.6, 0.5, 0.45])
+    command[:, TORSO] = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.4, -0.6], [-0.1, 0.9, 0.3], [0.0, 1.2, 0.0]])
+    command = reference.clamp(command)
+    joints = reference.standing_joints(command)
+    attitude = reference.pelvis_attitude(command[:, TORSO], joints[:, WAIST_JOINTS])
+    for row in range(4):
+        data.qpos[3:7], data.qpos[7:] = attitude[row].numpy(), joints[row].numpy()
+        mujoco.mj_kinematics(model, data)
+        roll, pitch, yaw = command[row, TORSO].tolist()
+        rotation = data.body("torso_link").xmat.reshape(3, 3)
+        assert math.atan2(rotation[2, 1], rotation[2, 2]) == pytest.approx(roll, abs=1e-5)
+        assert -math.asin(rotation[2, 0]) == pytest.approx(pitch, abs=1e-5)
+        assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(yaw, abs=1e-5)
+
+
+def test_arm_targets_lead_by_what_gravity_would_make_them_sag(reference: Reference, space: CommandSpace) -> None:
+    """Against MuJoCo's gravity torques in a bent posture."""
+    model = build_spec().compile()
+    data = mujoco.MjData(model)
+    command = space.neutral()[None]
+    command[0, HEIGHT], command[0, TORSO.start + 1] = 0.55, 0.8
+    command[0, ARMS] += 0.3
+    command = reference.clamp(command)
+    joints = reference.standing_joints(command)
+    data.qpos[3:7] = reference.pelvis_attitude(command[:, TORSO], joints[:, WAIST_JOINTS])[0].numpy()
+    data.qpos[7:] = joints[0].numpy()
+    mujoco.mj_forward(model, data)
+    lead = reference.joint_targets(ReferenceState.standing(command))[0, 15:] - command[0, ARMS]
+    torque = lead.numpy() * GAINS["stiff"].stiffness[15:]
+    np.testing.assert_allclose(torque, data.qfrc_bias[6 + 15 :], atol=2e-3)
+
+
+def test_the_prior_is_still_while_standing_and_its_legs_take_turns(reference: Reference, space: CommandSpace) -> None:
+    prior = GaitPrior(GaitPriorConfig())
+    command = space.neutral().repeat(2, 1)
+    command[:, VELOCITY] = torch.tensor([0.6, 0.0, 0.0])
+    assert (prior(ReferenceState.standing(command)) == 0.0).all()
+    halves = prior(ReferenceState(command, torch.tensor([1.0, 1.0 + math.pi])))
+    np.testing.assert_allclose(halves[1].numpy(), JOINTS_MIRROR(halves[0].numpy()), atol=1e-6)
+    middle = prior(ReferenceState(command[:1], torch.tensor([math.pi / 2])))[0]
+    assert middle[joint_index("left_knee_joint")].item() == pytest.approx(GaitPriorConfig().lift)
+    assert middle[joint_index("right_knee_joint")].item() == 0.0
+    assert halves.shape == (2, NUM_JOINTS)
