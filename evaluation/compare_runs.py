@@ -13,7 +13,7 @@ import tyro
 
 from evaluation.reporting.plots import plot_overlays
 from lowlevel.runs.command_line import command_line
-from lowlevel.runs.training_log import LOG_FILE
+from lowlevel.runs.run_folder import LOG_FILE
 from robots.errors import PilotError
 
 PANELS = {

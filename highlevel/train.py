@@ -14,11 +14,9 @@ import tyro
 from highlevel.learning.config import PlannerTrainingConfig
 from highlevel.learning.demonstrations import Demonstrations
 from highlevel.registration import find_controller
-from highlevel.run_folder import BEST_FOLDER, create_run, read_config
-from highlevel.trainer import PlannerTrainer
+from highlevel.trainer import BEST_FOLDER, PlannerTrainer
 from lowlevel.runs.command_line import command_line
-from lowlevel.runs.provenance import require_unused
-from robots.errors import PilotError
+from lowlevel.runs.run_folder import RunFolder, resumed_run
 
 
 @dataclass(frozen=True)
@@ -31,28 +29,28 @@ class Arguments:
     name: str = ""
     """Name of the run's folder; task and time by default."""
     resume: Path | None = None
-    """Folder of a run to continue; its own configuration is used and all other options must be left out."""
+    """Folder of a run to continue with its own configuration; options given beside it replace parts of that."""
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``train-highlevel``."""
     given = sys.argv[1:] if arguments is None else arguments
-    parsed = tyro.cli(Arguments, args=given, default=Arguments(config=PlannerTrainingConfig()))
     with command_line("train-highlevel", "interrupted before training began"):
-        trainer = _resumed(given, parsed.resume) if parsed.resume else _fresh(parsed)
-        print(f"training in {trainer.folder}", flush=True)
-        trainer.run()
+        parsed = tyro.cli(Arguments, args=given, default=Arguments(config=_default_config(given)))
+        trainer = _resumed(parsed.config, parsed.resume) if parsed.resume else _fresh(parsed)
+        print(f"training in {trainer.run.path}", flush=True)
+        trainer.train()
     if trainer.best_rate >= 0:
-        best = trainer.folder / BEST_FOLDER
+        best = trainer.run.path / BEST_FOLDER
         print(f"best planner {best} with {trainer.best_rate:.1%} success on the selection episodes")
     if not trainer.is_finished:
-        print(f"train-highlevel: stopped; continue with --resume {trainer.folder}", file=sys.stderr)
+        print(f"train-highlevel: stopped; continue with --resume {trainer.run.path}", file=sys.stderr)
         sys.exit(130)
 
 
 def _fresh(arguments: Arguments) -> PlannerTrainer:
     folder = arguments.output / (arguments.name or f"{arguments.config.task}-{time.strftime('%Y%m%d-%H%M%S')}")
-    require_unused(folder)
+    RunFolder(folder).require_unused()
     config = replace(arguments.config, controller=find_controller(arguments.config.controller).resolve())
     if config.demonstration_file is not None:
         config = replace(config, demonstration_file=config.demonstration_file.resolve())
@@ -60,17 +58,28 @@ def _fresh(arguments: Arguments) -> PlannerTrainer:
     if config.demonstration_file is not None:
         # A file that cannot be used is refused before anything is written.
         Demonstrations.load(config.demonstration_file).source.require_like(trainer.source)
-    create_run(folder, config)
+    trainer.run.claim()
+    trainer.run.describe(config)
     trainer.save()
     return trainer
 
 
-def _resumed(given: list[str], folder: Path) -> PlannerTrainer:
-    others = [word for word in given if word.startswith("--") and word.partition("=")[0] != "--resume"]
-    if others:
-        raise PilotError("--resume takes the configuration of the run it continues: leave the other options out")
-    trainer = _trainer(read_config(folder), folder)
+def _default_config(given: list[str]) -> PlannerTrainingConfig:
+    """A run that is continued decides the defaults of everything else."""
+    run = resumed_run(given)
+    if run is None:
+        return PlannerTrainingConfig()
+    config = run.config(PlannerTrainingConfig)
+    controller, demonstrations = (
+        None if path is None else Path(path) for path in (config.controller, config.demonstration_file)
+    )
+    return replace(config, controller=controller, demonstration_file=demonstrations)
+
+
+def _resumed(config: PlannerTrainingConfig, folder: Path) -> PlannerTrainer:
+    trainer = _trainer(config, folder)
     trainer.load()
+    trainer.run.describe(config)
     return trainer
 
 

@@ -1,4 +1,4 @@
-"""Training a planner: demonstrations, cloning, critic warm-up, PPO. Read :meth:`PlannerTrainer.run` first."""
+"""Training a planner: demonstrations, cloning, critic warm-up, PPO. Read :meth:`PlannerTrainer.train` first."""
 
 from __future__ import annotations
 
@@ -22,24 +22,18 @@ from highlevel.learning.demonstrations import Demonstrations, Source, record
 from highlevel.learning.policy import PlannerActor
 from highlevel.learning.ppo import PlannerPPO
 from highlevel.planner import Planner, PlannerConfig
-from highlevel.run_folder import (
-    BEST_FOLDER,
-    CLONED_FOLDER,
-    DEMONSTRATIONS_FILE,
-    TENSORBOARD_FOLDER,
-    drop_log_after,
-    log_figures,
-    read_state,
-    write_state,
-)
 from highlevel.task import load_task
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.control.controller import Controller, content_hash
 from lowlevel.runs.interrupts import stop_on_signals
 from lowlevel.runs.progress import ProgressReport
-from lowlevel.runs.provenance import describe_run
+from lowlevel.runs.run_folder import TENSORBOARD_FOLDER, RunFolder, describe_run
 from robots.errors import PilotError
 
+DEMONSTRATIONS_FILE = "demonstrations.npz"
+"""Successful episodes of the scripted expert, in the folder of a run."""
+CLONED_FOLDER, BEST_FOLDER = "cloned", "best"
+"""The planner after cloning, and the one with the highest success rate on the selection episodes."""
 SELECTION_SEED, DEMONSTRATION_SEED, TRAINING_SEED = 1_000_000, 2_000_000, 3_000_000
 """Seeds of the episodes for each purpose, far from each other and from those of evaluations, so none is met twice."""
 
@@ -60,7 +54,7 @@ class PlannerTrainer:
             raise PilotError("the run needs the folder of a controller")
         config.require_valid()
         self.config = config
-        self.folder = folder
+        self.run = RunFolder(folder)
         self.controller = config.controller
         self.episode_seed = TRAINING_SEED + config.seed
         self.environment = self._build_environment(self.episode_seed)
@@ -99,7 +93,7 @@ class PlannerTrainer:
 
     # -- the run ----------------------------------------------------------------------------------------------
 
-    def run(self) -> None:
+    def train(self) -> None:
         """Go through the remaining phases; Ctrl-C and SIGTERM end the run with its work saved."""
         with stop_on_signals(self._request_stop):
             if self.phase == "demonstrations":
@@ -135,7 +129,7 @@ class PlannerTrainer:
                 )
             self.model.set_exploration(self.config.ppo.log_std_after_cloning)
             self._log({f"cloning/{name}": value for name, value in asdict(result).items()})
-            self.planner().save(self.folder / CLONED_FOLDER)
+            self.planner().save(self.run.path / CLONED_FOLDER)
         # A run that was resumed before this has no seed pending, and recording has left its own.
         self.vec_env.seed(self.episode_seed)
         self.phase = "ppo"
@@ -149,7 +143,7 @@ class PlannerTrainer:
             loaded.source.require_like(self.source)
             self.demonstrated_on = loaded.source.controller
             return loaded
-        path = self.folder / DEMONSTRATIONS_FILE
+        path = self.run.path / DEMONSTRATIONS_FILE
         done = Demonstrations.load(path) if path.is_file() else None
         wanted = config.demonstrations - (done.count if done else 0)
         if done is not None and wanted <= 0:
@@ -177,7 +171,7 @@ class PlannerTrainer:
 
     def _improve(self) -> None:
         """PPO, from the cloned policy or from nothing."""
-        self.model.set_logger(configure(str(self.folder / TENSORBOARD_FOLDER), ["tensorboard"]))
+        self.model.set_logger(configure(str(self.run.path / TENSORBOARD_FOLDER), ["tensorboard"]))
         remaining = self.config.total_decisions - self.model.num_timesteps
         if remaining > 0:
             with _progress("PPO", self.config.total_decisions) as update:
@@ -229,7 +223,7 @@ class PlannerTrainer:
         if (rate, -duration) > (self.best_rate, -self.best_duration):
             self.best_rate, self.best_duration = rate, duration
             planner.provenance["selection"] = {"success_rate": rate, "episodes": len(records)}
-            planner.save(self.folder / BEST_FOLDER)
+            planner.save(self.run.path / BEST_FOLDER)
         figures = stage_shares(records, self.environment.task.stages)
         figures["success_rate"] = rate
         figures["fall_rate"] = sum(record.failure == "fall" for record in records) / len(records)
@@ -238,7 +232,7 @@ class PlannerTrainer:
         return rate
 
     def _log(self, figures: dict[str, float]) -> None:
-        log_figures(self.folder, figures, self.model.num_timesteps, self.trained_seconds)
+        self.run.log(figures, self.trained_seconds, "decisions", self.model.num_timesteps)
 
     # -- saving -----------------------------------------------------------------------------------------------
 
@@ -258,7 +252,7 @@ class PlannerTrainer:
             "last_selection": self.last_selection,
             "trained_seconds": self.trained_seconds,
         }
-        write_state(self.folder, state)
+        self.run.save(state)
 
     def load(self) -> None:
         """Continue from the training state in the folder; running episodes begin anew.
@@ -267,7 +261,7 @@ class PlannerTrainer:
             PilotError: if there is none.
             PilotError: if it is damaged, belongs to another configuration, or the controller has changed since.
         """
-        state = read_state(self.folder)
+        state = self.run.load()
         try:
             self.model.load_state_dict(state)
             self.phase, self.trained_seconds = state["phase"], state["trained_seconds"]
@@ -276,7 +270,7 @@ class PlannerTrainer:
             episode, controller = state["episode"], state["controller"]
         except (KeyError, RuntimeError, ValueError) as error:
             reason = str(error).splitlines()[-1].strip()
-            raise PilotError(f"the training state in {self.folder} does not fit this run: {reason}") from error
+            raise PilotError(f"the training state in {self.run.path} does not fit this run: {reason}") from error
         if controller != self.controller_hash:
             raise PilotError(
                 f"this run is for controller {controller}, but {self.controller} is {self.controller_hash} now: "
@@ -286,7 +280,7 @@ class PlannerTrainer:
         self.environment.episode = episode
         # The reset at the start of learning takes the episodes after these.
         self.vec_env._reset_seeds()
-        drop_log_after(self.folder, self.model.num_timesteps)
+        self.run.drop_log_after("decisions", self.model.num_timesteps)
 
 
 class _TrainingCallback(BaseCallback):

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import FRAME_SIZE, HISTORY_LENGTH
 from lowlevel.control.reference import ReferenceState
-from lowlevel.world.terrain import MAP_SIZE
 from robots.g1.constants import NUM_JOINTS
 
 

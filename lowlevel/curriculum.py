@@ -28,8 +28,9 @@ class CurriculumConfig:
     """Growth of an opening per update."""
     quality: float = 0.45
     """Quality of tracking above which a kind may grow, under the noise of exploration."""
-    steps_between_falls: float = 300.0
-    """Control steps of a kind per fall above which it may grow."""
+    steps_between_falls: float = 1000.0
+    """Control steps of a kind per fall above which it may grow; below half as many it shrinks. Where every robot falls
+    no action is better than another, and nothing is learned."""
     smoothing: float = 0.1
     """Weight of the last update in the measured averages."""
     most_often: float = 2.0
@@ -62,8 +63,11 @@ class Curriculum:
         weight = config.smoothing * seen
         self.quality += weight * (quality / steps.clamp_min(1.0) - self.quality)
         self.fall_rate += weight * (falls / steps.clamp_min(1.0) - self.fall_rate)
-        tracked = (self.quality > config.quality) & (self.fall_rate * config.steps_between_falls < 1.0)
-        self.opening = (self.opening + config.growth * (seen & tracked)).clamp_max(1.0)
+        falls_per_budget = self.fall_rate * config.steps_between_falls
+        grows = seen & (self.quality > config.quality) & (falls_per_budget < 1.0)
+        shrinks = seen & (falls_per_budget > 2.0)
+        change = config.growth * (grows.float() - shrinks.float())
+        self.opening = (self.opening + change).clamp(config.start, 1.0)
         self._sums = torch.zeros_like(self._sums)
 
     def probabilities(self, shares: Tensor) -> Tensor:

@@ -15,8 +15,8 @@ from lowlevel.control.observation import FRAME, normalised_columns
 from lowlevel.environment import PilotEnvironment
 from lowlevel.networks.actor import PilotActor
 from lowlevel.runs.command_line import command_line
-from lowlevel.runs.provenance import find_state, git_revision, read_run_description, read_training_config
-from lowlevel.trainer import Trainer
+from lowlevel.runs.run_folder import RunFolder, git_revision
+from lowlevel.trainer import Trainer, TrainingConfig
 from robots.errors import PilotError
 from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, GAINS, JOINT_NAMES
 
@@ -69,12 +69,12 @@ def export_controller(trainer: Trainer, folder: Path, revision: str | None = Non
 
 def export_run(run: Path, controller: Path) -> None:
     """Freeze the last saved state of a training ``run``, which may still be going on, into a ``controller`` folder."""
-    config = read_training_config(run)
+    config = RunFolder(run).config(TrainingConfig)
     small = replace(config, environment=replace(config.environment, num_robots=config.ppo.minibatches), device="cpu")
     trainer = Trainer(small, run)
-    trainer.load(find_state(run), with_environment=False)
+    trainer.load(with_environment=False)
     trainer.config = config  # provenance tells of the run, not of the small environment it was rebuilt in
-    export_controller(trainer, controller, read_run_description(run).get("revision"))
+    export_controller(trainer, controller, trainer.run.description().get("revision"))
     print(f"{trainer.steps} steps; the controller lies in {controller}")
 
 

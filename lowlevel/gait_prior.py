@@ -3,7 +3,7 @@
 No feedback, three motions: the swing leg lifts, the pelvis shifts over the stance foot, and the legs stride. The
 stride is fitted to the speed that is told while the robot learns: a prior that walks at half of it leaves a policy that
 walks at half of it, long after the prior has gone, because the tracking rewards are flat far from their goal. When the
-robot walks, policy and prior are cloned into the policy alone (:mod:`lowlevel.learning.absorption`).
+robot walks, policy and prior are cloned into the policy alone (:mod:`lowlevel.absorption`).
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class GaitPrior:
         """Move the stride towards one with which robots walk as told, by what was observed over all ranks.
 
         A linear fit says how they walk for what they are told. What it mixes of forwards with sideways and turning is
-        chance, because the robot is symmetric.
+        chance, because the robot is symmetric. No amplitude moves by more than half of the first one.
         """
         told_told, told_walked = sum_over_ranks(torch.cat([self._told_told, self._told_walked], dim=1)).split((4, 3), 1)
         self._told_told.zero_(), self._told_walked.zero_()
@@ -100,9 +100,10 @@ class GaitPrior:
         walks = torch.linalg.solve(told_told + torch.eye(4, device=told_told.device), told_walked).T
         error = torch.eye(3, 4, device=walks.device) - walks
         symmetric = torch.tensor([[1, 0, 0, 1], [0, 1, 1, 0], [0, 1, 1, 0]], device=walks.device)
-        scale = torch.tensor(self.config.stride, device=walks.device)[:, None]
+        first = first_stride(self.config).to(walks.device)
+        scale = first.sum(dim=1, keepdim=True)
         change = self.config.fitting_rate * scale * error.clamp(-1.0, 1.0) * symmetric
-        self.stride = (self.stride + change).clamp(-1.0, 1.0)
+        self.stride = first + (self.stride + change - first).clamp(-0.5 * scale, 0.5 * scale)
 
 
 def first_stride(config: GaitPriorConfig) -> Tensor:

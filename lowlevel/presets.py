@@ -74,6 +74,7 @@ STAGES = (
         most_steps=6_000_000,
         std=(0.05, 0.3),
         gait_prior=1.0,
+        fits_prior=True,
         mixture=(("forward", 0.5), ("steer", 0.3), ("stand", 0.1), ("squat", 0.1)),
         rewards=SHAPED,
         randomization=GENTLE,
@@ -100,8 +101,8 @@ STAGES = (
     ),
     Stage(
         "squat",
-        waits_for="curriculum/quality/squat",
-        above=0.72,
+        waits_for="curriculum/opening/squat",
+        above=0.98,
         most_steps=8_000_000,
         std=(0.05, 0.18),
         mixture=(("steer", 0.4), ("slow", 0.1), ("stand", 0.1), ("squat", 0.4)),

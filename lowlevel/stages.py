@@ -32,6 +32,8 @@ class Stage:
     """Bounds of the exploration noise [action units]."""
     gait_prior: float = 0.0
     """Weight of the gait prior. When a stage without prior follows one with it, the policy absorbs the prior first."""
+    fits_prior: bool = False
+    """Whether the prior's stride comes to fit the told velocity: not before the robot walks at all."""
     rollout_doublings: int = 0
     """Rollouts are 2 to this power times as long as at first: the better the policy, the more samples it takes to see
     what would improve it."""

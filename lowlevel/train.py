@@ -17,15 +17,7 @@ from lowlevel.presets import PRESETS
 from lowlevel.runs import distributed
 from lowlevel.runs.checks import require_finite
 from lowlevel.runs.command_line import command_line
-from lowlevel.runs.provenance import (
-    describe_run,
-    find_state,
-    make_run_folder,
-    read_run_description,
-    read_training_config,
-    require_unused,
-    write_run_description,
-)
+from lowlevel.runs.run_folder import RunFolder, resumed_run
 from lowlevel.trainer import Trainer, TrainingConfig
 from robots.errors import PilotError
 
@@ -65,17 +57,17 @@ def _run(arguments: list[str]) -> None:
     try:
         trainer = _resumed(parsed) if parsed.resume else _fresh(parsed, device)
         if distributed.rank() == 0:
-            write_run_description(trainer.folder, describe_run(parsed.config, preset=parsed.preset))
-            print(f"training in {trainer.folder}", flush=True)
+            trainer.run.describe(parsed.config, preset=parsed.preset)
+            print(f"training in {trainer.run.path}", flush=True)
         trainer.train()
         if distributed.rank() == 0:
             outcome = f"no controller yet: the stage {trainer.stage.name!r} has a gait prior"
             if trainer.stage.gait_prior == 0.0:
-                export_controller(trainer, trainer.folder / "controller")
-                outcome = f"the controller lies in {trainer.folder / 'controller'}"
+                export_controller(trainer, trainer.run.path / "controller")
+                outcome = f"the controller lies in {trainer.run.path / 'controller'}"
             print(f"{trainer.steps} steps in {trainer.trained_seconds / 3600:.2f} h; {outcome}")
         if trainer.steps < parsed.config.total_steps:
-            print(f"train-lowlevel: stopped; continue with --resume {trainer.folder}", file=sys.stderr)
+            print(f"train-lowlevel: stopped; continue with --resume {trainer.run.path}", file=sys.stderr)
             sys.exit(130)
     finally:
         distributed.stop()
@@ -85,13 +77,11 @@ def _defaults(arguments: list[str]) -> Arguments:
     """Preset and earlier run decide the defaults of everything else, so they are read first."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset")
-    parser.add_argument("--resume", type=Path)
-    chosen = parser.parse_known_args(arguments)[0]
-    if chosen.resume is not None:
+    chosen, run = parser.parse_known_args(arguments)[0], resumed_run(arguments)
+    if run is not None:
         if chosen.preset is not None:
             raise PilotError("--resume takes the configuration of the run it continues: leave --preset out")
-        config = read_training_config(chosen.resume)
-        return Arguments(config=config, preset=read_run_description(chosen.resume).get("preset", "unknown"))
+        return Arguments(config=run.config(TrainingConfig), preset=run.description().get("preset", "unknown"))
     preset = chosen.preset or Arguments.preset
     if preset not in PRESETS:
         raise PilotError(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}")
@@ -101,30 +91,21 @@ def _defaults(arguments: list[str]) -> Arguments:
 def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
     folder = parsed.output / (parsed.name or f"{parsed.preset}-{time.strftime('%Y%m%d-%H%M%S')}")
     if distributed.rank() == 0:  # other ranks may come when this one has made the folder
-        require_unused(folder)
+        RunFolder(folder).require_unused()
     trainer = Trainer(replace(parsed.config, device=str(device)), folder)
     if distributed.rank() == 0:
-        make_run_folder(folder)
+        trainer.run.claim()
     return trainer
 
 
 def _resumed(parsed: Arguments) -> Trainer:
     assert parsed.resume is not None
     trainer = Trainer(parsed.config, parsed.resume)
-    _load(trainer, parsed.resume)
-    return trainer
-
-
-def _load(trainer: Trainer, run: Path) -> None:
-    """Continue from the training state of a run."""
-    path = find_state(run)
-    try:
-        trainer.load(path)
-    except KeyError as error:
-        raise PilotError(f"{path} is not a training state of this version: it has no {error}") from error
+    trainer.load()
     for network in (trainer.ppo.actor, trainer.ppo.critic):
         for name, weight in network.state_dict().items():
-            require_finite(f"weight {name!r} in {path}", weight)
+            require_finite(f"weight {name!r} of the run in {parsed.resume}", weight)
+    return trainer
 
 
 if __name__ == "__main__":

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Annotated, Any
 
 import torch
 import tyro
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 
+from lowlevel.absorption import AbsorptionConfig, absorb_prior
 from lowlevel.commands import shares
+from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import (
     FRAME,
     FRAME_SIZE,
@@ -28,21 +27,16 @@ from lowlevel.control.observation import (
 from lowlevel.curriculum import Curriculum, CurriculumConfig
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
 from lowlevel.gait_prior import first_stride
-from lowlevel.learning.absorption import AbsorptionConfig, absorb_prior
 from lowlevel.learning.ppo import PPO, PPOConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes
 from lowlevel.runs.distributed import any_rank, average_over_ranks, rank, world_size
-from lowlevel.runs.files import atomic_write
 from lowlevel.runs.interrupts import stop_on_signals
 from lowlevel.runs.progress import ProgressReport
-from lowlevel.runs.training_log import LOG_FILE, drop_entries_after, write_entry
+from lowlevel.runs.run_folder import RunFolder
 from lowlevel.stages import Stage
 from lowlevel.world.measures import TRACKING_FIGURES
-from lowlevel.world.terrain import MAP_SIZE
 from robots.errors import PilotError
 from robots.g1.constants import LOWER_JOINTS, NUM_JOINTS
-
-STATE_FILE = "training_state.pt"
 
 
 @dataclass(frozen=True)
@@ -104,7 +98,7 @@ class Trainer:
 
     def __init__(self, config: TrainingConfig, folder: Path) -> None:
         self.config = config
-        self.folder = folder
+        self.run = RunFolder(folder)
         self.curriculum = Curriculum(config.curriculum)
         self.ppo = PPO(
             config=config.ppo,
@@ -180,7 +174,9 @@ class Trainer:
         last_save = time.monotonic()
         progress = ProgressReport(hidden=rank() != 0)
         task = progress.add_task("starting", total=self.config.total_steps, completed=self.steps)
-        with stop_on_signals(self._request_stop), progress, self._log() as log:
+        if rank() == 0:
+            self.run.drop_log_after("steps", self.steps)
+        with stop_on_signals(self._request_stop), progress:
             # A rank that stopped alone would leave the others waiting for it in their next all-reduce.
             while self.steps < self.config.total_steps and not any_rank(self._stop_requested):
                 started = time.monotonic()
@@ -188,7 +184,8 @@ class Trainer:
                 seconds = time.monotonic() - started
                 self.trained_seconds += seconds
                 figures["speed/steps_per_second"] = self._steps_per_iteration / seconds
-                log(figures)
+                if rank() == 0:
+                    self.run.log(figures, self.trained_seconds, "steps", self.steps)
                 self._follow_stages(figures, lambda text: progress.update(task, description=text))
                 progress.update(task, completed=self.steps, description=self._headline(figures))
                 if time.monotonic() - last_save > self.config.save_interval:
@@ -226,14 +223,14 @@ class Trainer:
         steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
         self.curriculum.update()
         self._apply_curriculum()
-        if self.stage.gait_prior > 0.0:
+        if self.stage.fits_prior:
             self.environment.prior.fit()
             self.stride = self.environment.prior.stride
         figures = {f"reward/{name}": value for name, value in mean_terms.items()}
         figures |= {f"tracking/{name}": value for name, value in tracking.take().items()}
         figures |= {f"curriculum/{name}": value for name, value in self.curriculum.figures(self._shares).items()}
         figures["curriculum/stage"] = float(self.stage_number)
-        if self.stage.gait_prior > 0.0:
+        if self.stage.fits_prior:
             strides = zip(("forwards", "sideways", "turning"), self.stride.diagonal().tolist(), strict=True)
             figures |= {f"prior/{name}": stride for name, stride in strides}
         figures |= {f"learner/{name}": value for name, value in losses.items()}
@@ -260,25 +257,25 @@ class Trainer:
             "waited_for": self.waited_for,
         }
 
-    def save(self) -> Path:
+    def save(self) -> None:
         """Write the training state; a crash while writing leaves the previous one intact."""
-        path = self.folder / STATE_FILE
         if rank() == 0:
-            state = self.state_dict()
-            atomic_write(path, lambda file: torch.save(state, file))
-        return path
+            self.run.save(self.state_dict())
 
-    def load(self, path: Path, with_environment: bool = True) -> None:
-        """Continue from a training state that :meth:`save` wrote; where it has no environment the robots start anew.
+    def load(self, with_environment: bool = True) -> None:
+        """Continue from the training state in the folder; where it has no environment the robots start anew.
 
         The state is rank 0's: the robots of other ranks always start anew.
 
         Raises:
-            PilotError: if the file is damaged or belongs to another configuration.
+            PilotError: if there is none, it is damaged, or it belongs to another configuration.
         """
-        state = read_training_state(path)
+        state = self.run.load()
+        missing = self.state_dict().keys() - state.keys() - {"environment", "observation"}
+        if missing:
+            raise PilotError(f"the state in {self.run.path} is of another version: it has no {min(missing)!r}")
         if not torch.equal(state["action_scale"], self.environment.action_scale.cpu()):
-            raise PilotError(f"{path} was trained with other action scales than those of these gains: train anew")
+            raise PilotError(f"{self.run.path} was trained with other action scales than those of these gains")
         try:
             self.ppo.load_state_dict(state["ppo"])
         except (KeyError, RuntimeError, ValueError) as error:
@@ -309,40 +306,6 @@ class Trainer:
     def _request_stop(self) -> None:
         """End the run at the next safe point, with its work saved."""
         self._stop_requested = True
-
-    @contextmanager
-    def _log(self) -> Iterator[Any]:
-        """Figures go to TensorBoard and, one JSON object per line, to ``log.jsonl``."""
-        if rank() != 0:
-            yield lambda figures: None
-            return
-        writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.steps)
-        path = self.folder / LOG_FILE
-        drop_entries_after(path, "steps", self.steps)
-        with path.open("a") as file:
-
-            def log(figures: dict[str, float]) -> None:
-                for name, value in figures.items():
-                    writer.add_scalar(name, value, self.steps)
-                write_entry(file, {"steps": self.steps, "seconds": self.trained_seconds, **figures})
-
-            try:
-                yield log
-            finally:
-                writer.close()
-
-
-def read_training_state(path: Path) -> dict[str, Any]:
-    """Contents of a training state; only tensors and plain values are ever unpickled.
-
-    Raises:
-        PilotError: if the file is damaged.
-    """
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, OSError, ValueError, UnpicklingError) as error:
-        first_line = str(error).splitlines()[0]
-        raise PilotError(f"{path} is not a readable training state: {first_line}") from error
 
 
 def _tracking(result: StepResult) -> dict[str, Tensor]:

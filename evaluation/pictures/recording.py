@@ -23,9 +23,9 @@ from torch import Tensor
 from evaluation.pictures.visuals import VISIBLE_GROUPS, VisualTwin
 from evaluation.protocols.arena import Arena, Episode
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
+from lowlevel.control.elevation_map import MAP_CELLS, MAP_RESOLUTION
 from lowlevel.world.measures import Measurement
 from lowlevel.world.simulation import BatchSimulation
-from lowlevel.world.terrain import MAP_CELLS, MAP_RESOLUTION
 from robots.errors import PilotError
 from robots.g1.constants import ARM_JOINTS, JOINT_NAMES
 from robots.rotations import rotate_about_vertical

@@ -17,12 +17,13 @@ from torch import Tensor
 
 from lowlevel.commands import COMMAND_SIZE, HEIGHT, POSTURE
 from lowlevel.control.controller import Controller, Proprioception
+from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import NoiseConfig
 from lowlevel.environment import MAP_REFRESH_STEPS
 from lowlevel.world.measures import Measurement, has_fallen, measure
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
 from lowlevel.world.simulation import BatchSimulation
-from lowlevel.world.terrain import MAP_SIZE, Terrain, TerrainConfig
+from lowlevel.world.terrain import Terrain, TerrainConfig
 from robots.errors import PilotError
 from robots.g1.constants import DEFAULT_POSITION, LOWER_JOINTS, NUM_JOINTS, joint_index
 from robots.g1.model import ModelOptions, build_spec

@@ -19,9 +19,9 @@ from highlevel.gym_env import PlannerEnv
 from highlevel.task import load_task
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.control.controller import Controller, Proprioception
+from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.environment import PilotEnvironment
 from lowlevel.trainer import Trainer, TrainingConfig
-from lowlevel.world.terrain import MAP_SIZE
 from robots.g1.constants import NUM_JOINTS
 
 WINDOWS = 5

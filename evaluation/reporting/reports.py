@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.reporting.statistics import Figure
-from lowlevel.runs.provenance import git_revision
+from lowlevel.runs.run_folder import git_revision
 from robots.errors import PilotError
 
 METRICS_FILE, REPORT_FILE = "metrics.json", "report.md"

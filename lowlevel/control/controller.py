@@ -22,6 +22,7 @@ from torch import Tensor
 
 from lowlevel.commands import CommandSpace, clamp_posture
 from lowlevel.control.control_step import ControlStep, Memory
+from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.golden import GOLDEN_ROBOTS, golden_vectors
 from lowlevel.control.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, Proprioception, columns, normalised_columns
 from lowlevel.control.onnx_step import OnnxStep, export_step
@@ -30,7 +31,6 @@ from lowlevel.networks.actor import NetworkConfig, ObservationSizes, PilotActor
 from lowlevel.runs.configs import from_plain
 from lowlevel.runs.files import atomic_write
 from lowlevel.runs.frozen_folder import FrozenFolder
-from lowlevel.world.terrain import MAP_SIZE
 from robots.errors import PilotError
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from lowlevel.commands import COMMAND_SIZE, CommandSpace
+from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import Proprioception
-from lowlevel.world.terrain import MAP_SIZE
 from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS
 
 GOLDEN_ROBOTS = 4

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from lowlevel import commands
 from lowlevel.commands import COMMAND_SIZE, CommandSpace
+from lowlevel.control.elevation_map import MAP_MIRROR, MAP_SIZE
 from lowlevel.control.reference import Reference, ReferenceState
-from lowlevel.world.terrain import MAP_MIRROR, MAP_SIZE
 from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS
 from robots.g1.mirror import AXIAL_VECTOR, JOINTS_MIRROR, VECTOR, Mirror, concatenate, signs
 

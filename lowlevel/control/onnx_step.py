@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from lowlevel.commands import CommandSpace
 from lowlevel.control.control_step import ControlStep, Memory, StepResult
+from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import Proprioception
 from lowlevel.runs.files import atomic_write
-from lowlevel.world.terrain import MAP_SIZE
 from robots.g1.constants import NUM_JOINTS
 
 INPUTS = (

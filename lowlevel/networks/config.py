@@ -8,9 +8,6 @@ from torch import nn
 
 from robots.errors import PilotError
 
-MAP_SIDE = 11
-"""Cells along each side of the elevation map."""
-
 
 @dataclass(frozen=True)
 class ObservationSizes:
@@ -85,8 +82,8 @@ class NetworkConfig:
             raise PilotError(
                 f"attention_width {self.attention_width} is not a multiple of {self.attention_heads} heads"
             )
-        if any(window % 2 == 0 or window > MAP_SIDE for window in self.pooling_windows):
-            raise PilotError(f"pooling windows must be odd and at most {MAP_SIDE}, not {self.pooling_windows}")
+        if any(window % 2 == 0 for window in self.pooling_windows):
+            raise PilotError(f"pooling windows must be odd, not {self.pooling_windows}")
 
 
 def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:

@@ -8,26 +8,26 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lowlevel.networks.config import MAP_SIDE, NetworkConfig, ObservationSizes, perceptron
+from lowlevel.networks.config import NetworkConfig, ObservationSizes, perceptron
+from robots.errors import PilotError
 
 
-def pooling_matrix(windows: tuple[int, ...]) -> Tensor:
-    """Average pooling of the map, one window per feature, as a matrix (M, len(windows) * M).
+def pooling_matrix(side: int, windows: tuple[int, ...]) -> Tensor:
+    """Average pooling of a map of ``side`` x ``side`` = M cells as a matrix (M, len(windows) * M).
 
     ``map @ matrix`` lists, window by window, the mean around each cell; windows are cut at the border.
     """
-    cells = MAP_SIDE * MAP_SIDE
-    basis = torch.eye(cells).reshape(cells, 1, MAP_SIDE, MAP_SIDE)
+    basis = torch.eye(side * side).reshape(side * side, 1, side, side)
     pooled = [
         functional.avg_pool2d(basis, window, stride=1, padding=window // 2, count_include_pad=False)
         for window in windows
     ]
-    return torch.cat(pooled, dim=1).reshape(cells, -1)
+    return torch.cat(pooled, dim=1).reshape(side * side, -1)
 
 
-def cell_coordinates() -> Tensor:
+def cell_coordinates(side: int) -> Tensor:
     """Position of each cell relative to the base (2, M), in half map edges; x is the outer index."""
-    line = torch.linspace(-1.0, 1.0, MAP_SIDE)
+    line = torch.linspace(-1.0, 1.0, side)
     return torch.stack(torch.meshgrid(line, line, indexing="ij")).reshape(2, -1)
 
 
@@ -56,11 +56,12 @@ class MapEncoder(nn.Module):
         """Build the encoder.
 
         Raises:
-            ValueError: if the map is not 11 x 11.
+            PilotError: if the map is not a square, or smaller than a pooling window.
         """
         super().__init__()
-        if sizes.elevation_map != MAP_SIDE**2:
-            raise ValueError(f"the elevation map must have {MAP_SIDE**2} cells, not {sizes.elevation_map}")
+        side = math.isqrt(sizes.elevation_map)
+        if side * side != sizes.elevation_map or max(config.pooling_windows) > side:
+            raise PilotError(f"windows {config.pooling_windows} do not fit a map of {sizes.elevation_map} cells")
         self.heads = config.attention_heads
         self.features = config.token_features
         self.windows = len(config.pooling_windows)
@@ -74,8 +75,8 @@ class MapEncoder(nn.Module):
         self.output = nn.Linear(config.attention_width, config.attention_width)
         nn.init.xavier_uniform_(self.key_weight)
         nn.init.xavier_uniform_(self.value_weight)
-        self.register_buffer("pooling", pooling_matrix(config.pooling_windows), persistent=False)
-        self.register_buffer("coordinates", cell_coordinates(), persistent=False)
+        self.register_buffer("pooling", pooling_matrix(side, config.pooling_windows), persistent=False)
+        self.register_buffer("coordinates", cell_coordinates(side), persistent=False)
 
     def tokens(self, elevation_map: Tensor) -> tuple[Tensor, Tensor]:
         """Local features of every cell: shared-MLP features (N, C, M), and height, x, y (N, 3, M)."""

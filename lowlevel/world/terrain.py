@@ -14,22 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lowlevel.control.elevation_map import MAP_SIZE, map_points
 from robots.errors import PilotError
-from robots.g1.mirror import Mirror
 from robots.g1.model import WORLD_COLLISION
 from robots.rotations import rotate_about_vertical
 
-MAP_CELLS = 11
-"""Cells per side of the egocentric elevation map (paper III-A-1)."""
-MAP_RESOLUTION = 0.1
-"""Cell size of the elevation map [m]."""
-MAP_SIZE = MAP_CELLS * MAP_CELLS
 STANCE_REACH = 0.3
 """No part of a standing robot's soles is farther than this from the base, horizontally and along each axis [m]."""
-
-_cells = np.arange(MAP_SIZE).reshape(MAP_CELLS, MAP_CELLS)
-MAP_MIRROR = Mirror(_cells[:, ::-1].reshape(-1), np.ones(MAP_SIZE))
-"""Left-right mirror of a flattened map, rows along x and columns along y."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +90,7 @@ class Terrain:
         self._origin = torch.tensor([-size / 2, -size * len(config.tiles) / 2], device=device)
         # The outermost cells stand for the plane around the tiles.
         self._raster = torch.from_numpy(np.pad(self._rasterise(), 1)).to(device)
-        offsets = (torch.arange(MAP_CELLS, device=device) - MAP_CELLS // 2) * MAP_RESOLUTION
-        self._map_offsets = torch.stack(torch.meshgrid(offsets, offsets, indexing="ij"), -1).reshape(MAP_SIZE, 2)
+        self._map_offsets = map_points(device)
 
     def _rasterise(self) -> np.ndarray:
         config, resolution = self.config, self.config.raster_resolution

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from robots.g1.constants import ARM_JOINTS
-from robots.g1.kinematics import build_model
 from robots.turns import blend, turn_basis
 
 _ARM_LENGTH = 7
@@ -23,6 +22,9 @@ class ArmMass:
     """
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
+        # Here, so that what only needs the types of a controller loads without Pinocchio.
+        from robots.g1.kinematics import build_model
+
         model = build_model()
         first = 2 + ARM_JOINTS.start  # Pinocchio counts the universe and the floating base as joints
         joints = [range(start, start + _ARM_LENGTH) for start in (first, first + _ARM_LENGTH)]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evaluation.compare_runs import PANELS, main, read_curves
-from lowlevel.runs.training_log import LOG_FILE
+from lowlevel.runs.run_folder import LOG_FILE
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from highlevel import train
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.planner import Planner
 from highlevel.registration import register_tasks
-from highlevel.run_folder import BEST_FOLDER
 from highlevel.task import environment_id, load_task, task_names
+from highlevel.trainer import BEST_FOLDER
 
 
 @pytest.fixture(autouse=True)

@@ -29,6 +29,16 @@ def test_a_kind_opens_only_when_it_is_tracked_and_its_robots_stay_up() -> None:
         assert opening["squat"] == pytest.approx(config.start)  # nobody has tried
 
 
+def test_a_kind_closes_again_when_its_robots_fall() -> None:
+    curriculum = Curriculum(CurriculumConfig())
+    for _ in range(60):
+        see(curriculum, {"squat": 0.9})
+    widest = curriculum.opening[NAMES.index("squat")].item()
+    for _ in range(200):
+        see(curriculum, {"squat": 0.9}, fall_rate=0.01)
+    assert curriculum.opening[NAMES.index("squat")].item() == pytest.approx(CurriculumConfig().start) < widest
+
+
 def test_what_is_tracked_badly_is_drawn_more_often_down_to_a_floor() -> None:
     curriculum = Curriculum(CurriculumConfig())
     mixture = shares((("walk", 0.25), ("stand", 0.25), ("squat", 0.5)))

@@ -18,17 +18,9 @@ from lowlevel.export import export_run
 from lowlevel.networks.config import NetworkConfig
 from lowlevel.presets import PRESETS
 from lowlevel.runs.configs import from_plain
-from lowlevel.runs.provenance import (
-    describe_run,
-    make_run_folder,
-    read_run_description,
-    read_training_config,
-    require_unused,
-    write_run_description,
-)
-from lowlevel.runs.training_log import LOG_FILE
+from lowlevel.runs.run_folder import LOG_FILE, STATE_FILE, RunFolder, describe_run
 from lowlevel.train import main
-from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig
+from lowlevel.trainer import Trainer, TrainingConfig
 from robots.errors import PilotError
 
 TINY_NETWORK = NetworkConfig(
@@ -72,7 +64,7 @@ def test_resumed_run_is_bit_exact_over_twenty_updates(tmp_path: Path) -> None:
     unbroken.save()
     expected = run(unbroken, 20)
     resumed = Trainer(tiny(seed=5), tmp_path)
-    resumed.load(tmp_path / STATE_FILE)
+    resumed.load()
     figures = run(resumed, 20)
     assert torch.equal(weights(unbroken), weights(resumed))
     assert [without_clock(f) for f in figures] == [without_clock(f) for f in expected]
@@ -90,8 +82,8 @@ def test_configuration_survives_json(tmp_path: Path) -> None:
     for preset, config in PRESETS.items():
         description = describe_run(config, preset=preset)
         assert from_plain(TrainingConfig, json.loads(json.dumps(description["config"]))) == config
-    write_run_description(tmp_path, describe_run(PRESETS["no-moe"], preset="no-moe"))
-    assert read_training_config(tmp_path) == PRESETS["no-moe"]
+    RunFolder(tmp_path).describe(PRESETS["no-moe"], preset="no-moe")
+    assert RunFolder(tmp_path).config(TrainingConfig) == PRESETS["no-moe"]
 
 
 ARGUMENTS = [
@@ -112,13 +104,14 @@ def test_command_line_trains_and_resumes(tmp_path: Path, capsys: pytest.CaptureF
     main(["--resume", str(folder), "--total-steps", "192"])
     entries = [json.loads(line) for line in (folder / LOG_FILE).read_text().splitlines()]
     assert [entry["steps"] for entry in entries] == [64, 128, 192]
-    description = read_run_description(folder)
+    description = RunFolder(folder).description()
     assert description["preset"] == "no-mirror" and description["config"]["ppo"]["mirror_loss_weight"] == 0.0
+    assert [start["config"]["total_steps"] for start in description["earlier"]] == [128]
 
 
 def test_a_run_without_a_gait_prior_ends_with_its_controller(tmp_path: Path) -> None:
     Trainer(tiny(), tmp_path).save()
-    write_run_description(tmp_path, describe_run(tiny(), preset="simple"))
+    RunFolder(tmp_path).describe(tiny(), preset="simple")
     main(["--resume", str(tmp_path), "--total-steps", "64"])
     Controller.load(tmp_path / "controller")
     export_run(tmp_path, tmp_path / "exported")
@@ -126,15 +119,16 @@ def test_a_run_without_a_gait_prior_ends_with_its_controller(tmp_path: Path) -> 
 
 
 def test_of_two_runs_with_one_name_the_second_is_refused_before_the_first_has_saved(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    require_unused(folder)
-    make_run_folder(folder)
+    run = RunFolder(tmp_path / "run")
+    run.require_unused()
+    run.claim()
     with pytest.raises(PilotError, match="another run has just begun"):
-        make_run_folder(folder)
-    write_run_description(folder, {"preset": "simple"})
+        run.claim()
+    run.describe(tiny(), preset="simple")
+    described = run.description()
     with pytest.raises(SystemExit, match="a run that has saved nothing yet: give another --name"):
         main([*ARGUMENTS, "--output", str(tmp_path), "--name", "run"])
-    assert read_run_description(folder) == {"preset": "simple"}
+    assert run.description() == described
 
 
 def test_ctrl_c_ends_a_run_that_can_be_continued(
@@ -164,8 +158,8 @@ def test_killed_run_resumes_from_its_last_save(tmp_path: Path) -> None:
     time.sleep(0.3)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    trainer = Trainer(read_training_config(tmp_path / "run"), tmp_path / "run")
-    trainer.load(state)
+    trainer = Trainer(RunFolder(tmp_path / "run").config(TrainingConfig), tmp_path / "run")
+    trainer.load()
     assert trainer.steps > 0
     run(trainer, 1)
 
@@ -193,8 +187,9 @@ def test_a_state_that_cannot_be_used_is_refused_and_left_alone(tmp_path: Path) -
     folder = tmp_path / "run"
     folder.mkdir()
     trainer = Trainer(tiny(), folder)
-    path = trainer.save()
-    write_run_description(folder, describe_run(tiny(), preset="simple"))
+    trainer.save()
+    path = folder / STATE_FILE
+    RunFolder(folder).describe(tiny(), preset="simple")
     content, state = path.read_bytes(), trainer.state_dict()
 
     def refusal() -> str:
@@ -216,26 +211,16 @@ def test_a_state_that_cannot_be_used_is_refused_and_left_alone(tmp_path: Path) -
     assert f"weight {bias!r}" in refusal() and "is not finite" in refusal()
 
 
-def test_truncated_training_state_is_refused_and_left_alone(tmp_path: Path) -> None:
-    trainer = Trainer(tiny(), tmp_path)
-    path = trainer.save()
-    path.write_bytes(path.read_bytes()[:5000])
-    before = path.read_bytes()
-    with pytest.raises(ValueError, match="not a readable training state"):
-        Trainer(tiny(), tmp_path).load(path)
-    assert path.read_bytes() == before
-
-
-def test_the_shipped_learning_state_can_be_continued(tmp_path: Path) -> None:
+def test_the_shipped_learning_state_can_be_continued() -> None:
     run = Path(__file__).resolve().parents[2] / "checkpoints" / "training" / "pilot-g1-simple"
-    config = read_training_config(run)
+    config = RunFolder(run).config(TrainingConfig)
     small = replace(
         config,
         environment=replace(config.environment, num_robots=8, num_threads=1),
         ppo=replace(config.ppo, steps_per_update=4, minibatches=2),
     )
-    trainer = Trainer(small, tmp_path)
-    trainer.load(run / STATE_FILE)
+    trainer = Trainer(small, run)
+    trainer.load()
     trainer.observation = trainer.environment.reset()
     assert trainer.steps > 1_000_000 and trainer.stage.name == "squat"
     trainer.iterate()

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from lowlevel.absorption import AbsorptionConfig, absorb_prior
 from lowlevel.commands import KINDS
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
-from lowlevel.learning.absorption import AbsorptionConfig, absorb_prior
 from lowlevel.learning.ppo import PPOConfig
 from lowlevel.networks.config import NetworkConfig
 from lowlevel.presets import PRESETS
 from lowlevel.rewards import RewardWeights
 from lowlevel.stages import Stage
-from lowlevel.trainer import STATE_FILE, Trainer, TrainingConfig
+from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.randomization import RandomizationConfig
 
 QUICK = AbsorptionConfig(rounds=2, steps=4, mixed_rounds=1, gradient_steps=2, minibatch=16)
@@ -62,7 +62,7 @@ def test_a_resumed_run_goes_on_in_its_stage(tmp_path: Path) -> None:
     trainer = Trainer(config, tmp_path)
     trainer.train()
     resumed = Trainer(config, tmp_path)
-    resumed.load(tmp_path / STATE_FILE)
+    resumed.load()
     assert resumed.stage.name == "second" and resumed.stage_begin == trainer.stage_begin > 0
     assert resumed.ppo.storage.steps == 16
     first, second = trainer.iterate(), resumed.iterate()

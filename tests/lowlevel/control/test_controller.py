@@ -29,7 +29,7 @@ from lowlevel.environment import EnvironmentConfig
 from lowlevel.export import export_controller
 from lowlevel.trainer import Trainer, TrainingConfig
 
-SHIPPED = sorted((Path(__file__).parents[2] / "checkpoints" / "lowlevel").glob("*/"))
+SHIPPED = sorted((Path(__file__).parents[3] / "checkpoints" / "lowlevel").glob("*/"))
 
 
 @pytest.fixture(scope="module")

@@ -50,12 +50,12 @@ def test_attention_equals_multi_head_attention_with_explicit_keys_and_values() -
 
 def test_tokens_hold_pooled_heights_and_coordinates_of_their_cell() -> None:
     heights = torch.randn(5, 121)
-    pooled = (heights @ pooling_matrix((1, 3))).unflatten(1, (2, 11, 11))
+    pooled = (heights @ pooling_matrix(11, (1, 3))).unflatten(1, (2, 11, 11))
     image = heights.view(5, 11, 11)
     torch.testing.assert_close(pooled[:, 0], image)
     torch.testing.assert_close(pooled[:, 1, 4, 7], image[:, 3:6, 6:9].mean(dim=(1, 2)))
     torch.testing.assert_close(pooled[:, 1, 0, 10], image[:, 0:2, 9:11].mean(dim=(1, 2)))
-    x, y = cell_coordinates()
+    x, y = cell_coordinates(11)
     assert (x[0], y[0], x[-1], y[-1]) == (-1, -1, 1, 1)
     assert x[11] > x[0] and y[1] > y[0] and x[1] == x[0], "the map's rows run along x, its columns along y"
 

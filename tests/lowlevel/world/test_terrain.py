@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from lowlevel.world.terrain import MAP_CELLS, MAP_MIRROR, MAP_RESOLUTION, TILES, Terrain, TerrainConfig
+from lowlevel.control.elevation_map import MAP_CELLS, MAP_MIRROR, MAP_RESOLUTION
+from lowlevel.world.terrain import TILES, Terrain, TerrainConfig
 
 
 @pytest.fixture(scope="module")
