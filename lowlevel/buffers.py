@@ -30,6 +30,7 @@ class Buffers:
     foot_air_time: Tensor
     foot_contact_time: Tensor
     hand_force: Tensor
+    mean_velocity_error: Tensor
 
     @classmethod
     def empty(cls, neutral: Tensor) -> Buffers:
@@ -53,4 +54,5 @@ class Buffers:
             foot_air_time=zeros(2),
             foot_contact_time=zeros(2),
             hand_force=zeros(2, 3),
+            mean_velocity_error=zeros(3),
         )

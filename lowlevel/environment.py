@@ -32,7 +32,7 @@ from lowlevel.control.observation import (
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
-from lowlevel.world.measures import Measurement, height_error, is_lost, torso_error
+from lowlevel.world.measures import Measurement, height_error, is_lost, torso_error, velocity_error
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
 from lowlevel.world.simulation import BatchSimulation
 from lowlevel.world.snapshot import Snapshot, take_snapshot, with_rows
@@ -44,6 +44,8 @@ from robots.rotations import about_axis, multiply, rotate_about_vertical
 
 MAP_REFRESH_STEPS = 5
 """Control steps between refreshes of the elevation map: 10 Hz at 50 Hz control (paper IV-B)."""
+AVERAGING = 0.4
+"""Time constant of the averaged velocity error [s]: the sway of one step is averaged out, a drift is not."""
 UNDER_WAY = 50
 """Control steps after a reset from which a robot's velocity says something about its gait."""
 
@@ -202,6 +204,8 @@ class PilotEnvironment:
         buffers.previous_action, buffers.action = buffers.action, action
         buffers.episode_step += 1
         self._update_foot_times(measured)
+        error = velocity_error(measured, buffers.reference.command)
+        buffers.mean_velocity_error = torch.lerp(buffers.mean_velocity_error, error, self.control_period / AVERAGING)
         fallen = is_lost(measured, buffers.reference.command) | self.simulation.diverged()
         truncated = (buffers.episode_step >= self.max_steps) & ~fallen
         transition = Transition(
@@ -216,6 +220,7 @@ class PilotEnvironment:
             gait_frequency=self.config.reference.gait_frequency,
             foot_air_time=buffers.foot_air_time,
             foot_contact_time=buffers.foot_contact_time,
+            mean_velocity_error=buffers.mean_velocity_error,
             fallen=fallen,
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
@@ -316,6 +321,7 @@ class PilotEnvironment:
         self.randomizer.start(ids, joint_position)
         buffers.action[ids], buffers.previous_action[ids] = 0.0, 0.0
         buffers.foot_air_time[ids], buffers.foot_contact_time[ids] = 0.0, 0.0
+        buffers.mean_velocity_error[ids] = 0.0
         buffers.episode_step[ids] = 0
 
     # -- observation ------------------------------------------------------------------------------------------
@@ -362,6 +368,7 @@ class PilotEnvironment:
             exact_frame,
             height_error(measured, buffers.command)[:, None],
             torso_error,
+            buffers.mean_velocity_error,
             now.feet,
             buffers.hand_force.flatten(1) / 20.0,
             self.randomizer.state.friction,

@@ -16,8 +16,9 @@ TRACKING = RewardWeights(
     linear_velocity_fine=4.0,
     angular_velocity=5.0,
     angular_velocity_fine=3.0,
-    velocity_progress=4.0,
-    base_height=3.0,
+    mean_linear_velocity=3.0,
+    mean_angular_velocity=3.0,
+    base_height=5.0,
     torso_orientation=8.0,
     upper_body_position=1.5,
     alive=1.0,
@@ -30,7 +31,13 @@ TRACKING = RewardWeights(
 """Tracking counts for more than in the paper, and with it what is added to it."""
 
 SHAPED = replace(
-    TRACKING, foot_phase=3.0, foot_placement=5.0, contact_schedule=2.0, swing_height=3.0, linear_velocity_fine=3.0
+    TRACKING,
+    velocity_progress=4.0,
+    foot_phase=3.0,
+    foot_placement=5.0,
+    contact_schedule=2.0,
+    swing_height=3.0,
+    linear_velocity_fine=3.0,
 )
 """While the robot learns what a step is."""
 
@@ -84,7 +91,7 @@ STAGES = (
         waits_for="curriculum/quality/forward",
         above=0.62,
         most_steps=5_000_000,
-        std=(0.05, 0.18),
+        std=(0.05, 0.15),
         mixture=(("forward", 0.6), ("steer", 0.15), ("stand", 0.25)),
         rewards=STEPPING,
         randomization=GENTLE,
@@ -94,7 +101,7 @@ STAGES = (
         waits_for="curriculum/quality/steer",
         above=0.62,
         most_steps=8_000_000,
-        std=(0.05, 0.18),
+        std=(0.05, 0.15),
         mixture=(("forward", 0.25), ("steer", 0.45), ("slow", 0.1), ("stand", 0.2)),
         rewards=STEPPING,
         randomization=GENTLE,
@@ -104,7 +111,7 @@ STAGES = (
         waits_for="curriculum/opening/squat",
         above=0.98,
         most_steps=8_000_000,
-        std=(0.05, 0.18),
+        std=(0.05, 0.1),
         mixture=(("steer", 0.4), ("slow", 0.1), ("stand", 0.1), ("squat", 0.4)),
         rewards=STEPPING,
         randomization=GENTLE,
@@ -114,7 +121,7 @@ STAGES = (
         waits_for="curriculum/opening/stand_and_work",
         above=0.98,
         most_steps=15_000_000,
-        std=(0.05, 0.15),
+        std=(0.05, 0.1),
         mixture=(("steer", 0.3), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.5)),
         rewards=STEPPING,
         randomization=GENTLE,
@@ -124,7 +131,7 @@ STAGES = (
         waits_for="curriculum/opening/walk_and_work",
         above=0.98,
         most_steps=20_000_000,
-        std=(0.05, 0.15),
+        std=(0.05, 0.1),
         rollout_doublings=1,
         mixture=(("steer", 0.2), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.2), ("walk_and_work", 0.4)),
         rewards=STEPPING,
@@ -133,7 +140,7 @@ STAGES = (
     Stage(
         "harden",
         most_steps=60_000_000,
-        std=(0.05, 0.13),
+        std=(0.04, 0.1),
         rollout_doublings=2,
         mixture=EVERYTHING,
         terrain=SLABS,
@@ -141,7 +148,7 @@ STAGES = (
     ),
     Stage(
         "refine",
-        std=(0.05, 0.10),
+        std=(0.03, 0.08),
         rollout_doublings=2,
         arms_act=True,
         mixture=EVERYTHING,

@@ -40,6 +40,8 @@ class RewardWeights:
     linear_velocity_fine: float = 0.0
     angular_velocity_fine: float = 0.0
     velocity_progress: float = 0.0
+    mean_linear_velocity: float = 0.0
+    mean_angular_velocity: float = 0.0
     # Additions: the shape of a gait
     foot_phase: float = 0.0
     contact_schedule: float = 0.0
@@ -70,6 +72,8 @@ class Transition:
     gait_frequency: float
     foot_air_time: Tensor
     foot_contact_time: Tensor
+    mean_velocity_error: Tensor
+    """Running mean of the velocity error (N, 3) [m/s, m/s, rad/s]."""
     fallen: Tensor
 
     @cached_property
@@ -219,6 +223,19 @@ def linear_velocity_fine(t: Transition, variance: float = 0.04) -> Tensor:
 def angular_velocity_fine(t: Transition, variance: float = 0.04) -> Tensor:
     """Narrow Gaussian kernel on the yaw rate error, ``variance`` [rad^2/s^2]."""
     return torch.exp(-velocity_error(t.measured, t.command)[:, 2].square() / variance)
+
+
+def mean_linear_velocity(t: Transition) -> Tensor:
+    """Laplace kernel on the mean horizontal velocity error, scale 0.1 m/s.
+
+    The pelvis sways by as much with every step: at once, a drift of 0.1 m/s hardly changes the kernels above.
+    """
+    return torch.exp(-t.mean_velocity_error[:, :2].norm(dim=-1) / 0.1)
+
+
+def mean_angular_velocity(t: Transition) -> Tensor:
+    """Laplace kernel on the mean yaw rate error, scale 0.15 rad/s."""
+    return torch.exp(-t.mean_velocity_error[:, 2].abs() / 0.15)
 
 
 def vertical_velocity(t: Transition) -> Tensor:

@@ -22,6 +22,7 @@ from lowlevel.control.observation import (
     MIRRORS,
     PRIVILEGED,
     PRIVILEGED_SIZE,
+    columns,
     normalised_columns,
 )
 from lowlevel.curriculum import Curriculum, CurriculumConfig
@@ -109,6 +110,7 @@ class Trainer:
             device=config.device,
             command_columns=~normalised_columns(FRAME),
             privileged_command_columns=~normalised_columns(PRIVILEGED),
+            gait_clock=columns(FRAME, "gait_clock"),
             seed=config.seed,
         )
         self.steps = 0

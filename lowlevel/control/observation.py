@@ -65,6 +65,7 @@ PRIVILEGED: tuple[Block, ...] = (
     *FRAME,
     Block("base_height_error", signs(1)),
     Block("torso_error", AXIAL_VECTOR),
+    Block("mean_velocity_error", signs(1, -1, -1)),
     Block("foot_contact", _PAIR, normalised=False),
     Block("foot_clearance", _PAIR),
     Block("foot_position", _PAIR_VECTOR),

@@ -31,6 +31,7 @@ def standing() -> Transition:
         gait_frequency=1.25,
         foot_air_time=torch.zeros(4, 2),
         foot_contact_time=torch.zeros(4, 2),
+        mean_velocity_error=torch.zeros(4, 3),
         fallen=torch.zeros(4, dtype=torch.bool),
     )
 

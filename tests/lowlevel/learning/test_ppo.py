@@ -213,6 +213,26 @@ def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
     assert float(deviations.min()) > 0.2999 and float(deviations.max()) < 0.4001
 
 
+def test_gait_noise_has_unit_variance_and_repeats_with_the_clock() -> None:
+    robots = 4096
+    ppo = make_ppo(robots, gait_noise_share=1.0, gait_noise_steps=1e9)
+    ppo.gait_clock = slice(0, 2)
+
+    def noise(phase: float | None) -> torch.Tensor:
+        frame = torch.zeros(robots, SIZES.frame)
+        if phase is not None:
+            frame[:, 0], frame[:, 1] = math.sin(phase), math.cos(phase)
+        return ppo._noise(frame)
+
+    first, half, again, still = noise(0.4), noise(0.4 + math.pi), noise(0.4), noise(None)
+    assert torch.equal(first, again) and not torch.allclose(first, half)
+    torch.testing.assert_close(noise(None), still)
+    for pattern in (first, half, still):
+        torch.testing.assert_close(pattern.std(dim=0), torch.ones(SIZES.action), rtol=0.05, atol=0.0)
+    ppo.config = dataclasses.replace(ppo.config, gait_noise_share=0.5)
+    assert torch.corrcoef(torch.stack([noise(0.4)[:, 0], first[:, 0]]))[0, 1] == pytest.approx(0.5**0.5, abs=0.05)
+
+
 @pytest.mark.parametrize(("bounds", "expected"), [((0.05, 1.0), 0.2), ((0.05, 0.1), 0.1), ((0.4, 1.0), 0.4)])
 def test_noise_moves_into_the_bounds_of_a_stage(bounds: tuple[float, float], expected: float) -> None:
     ppo = make_ppo(initial_std=0.2)

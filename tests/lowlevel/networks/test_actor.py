@@ -161,8 +161,8 @@ def test_commands_keep_their_fixed_scale() -> None:
 
 
 def test_wrong_sizes_are_refused() -> None:
-    with pytest.raises(ValueError, match="121 cells"):
-        MapEncoder(ObservationSizes(10, 5, 100, 12, 4), NetworkConfig())
+    with pytest.raises(ValueError, match="do not fit a map of 100 cells"):
+        MapEncoder(ObservationSizes(10, 5, 100, 12, 4), NetworkConfig(pooling_windows=(1, 11)))
     with pytest.raises(ValueError, match="multiple of 5 heads"):
         NetworkConfig(attention_heads=5)
     with pytest.raises(ValueError, match="must be odd"):
