@@ -141,7 +141,7 @@ def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tupl
         for stage in task.stages[len(stage_times) : passed]:
             stage_times[stage] = seconds
             instants[stage] = environment.simulation.robot_data(0).qpos.copy()
-        elevation = environment.terrain.elevation_map(measured.robot.base_position, measured.heading)
+        elevation = environment.world.elevation(measured)
         fraction = in_decision / task.action.decision_steps
         film.add(
             time=seconds,
@@ -165,7 +165,7 @@ def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tupl
     instants["start"] = environment.simulation.robot_data(0).qpos.copy()
 
     def add_surroundings(spec: mujoco.MjSpec) -> None:
-        environment.terrain.add_to(spec)
+        environment.world.terrain.add_to(spec)
         task.add_to(spec)
 
     twin = VisualTwin(add_surroundings)

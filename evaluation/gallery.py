@@ -102,7 +102,7 @@ def draw(controller: Controller, seed: int) -> np.ndarray:
         if down.any():
             pose = POSES[int(torch.nonzero(down)[0, 0])]
             raise PilotError(f"the robot falls when told {pose.name!r}: there is nothing to draw")
-    twin = VisualTwin(arena.terrain.add_to)
+    twin = VisualTwin(arena.world.terrain.add_to)
     pictures = []
     with Painter(twin.model) as painter:
         for row in range(len(POSES)):

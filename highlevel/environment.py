@@ -16,22 +16,14 @@ from torch import Tensor
 
 from highlevel.action import ActionMap, interpolate
 from highlevel.task import Decision, ObservationBlock, Task, rows
-from lowlevel.commands import COMMAND_SIZE, HEIGHT, POSTURE
-from lowlevel.control.controller import Controller, Proprioception
+from lowlevel.commands import COMMAND_SIZE
+from lowlevel.control.controller import Controller
 from lowlevel.runs.checks import require_finite
-from lowlevel.world.measures import Measurement, has_fallen, measure
-from lowlevel.world.simulation import BatchSimulation
-from lowlevel.world.terrain import Terrain, TerrainConfig
-from robots.errors import PilotError
-from robots.g1.constants import (
-    DEFAULT_POSITION,
-    LOWER_JOINTS,
-    NUM_JOINTS,
-    PELVIS_BODY,
-    WAIST_JOINTS,
-)
-from robots.g1.model import ModelOptions, build_spec
-from robots.rotations import about_axis, conjugate, multiply
+from lowlevel.world.measures import Measurement
+from lowlevel.world.terrain import TerrainConfig
+from lowlevel.world.world import World
+from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS
+from robots.g1.model import ModelOptions
 
 ROBOT_BLOCKS = (
     ObservationBlock("base_angular_velocity", 3, 1.0),
@@ -42,8 +34,6 @@ ROBOT_BLOCKS = (
 )
 """The robot's part of the paper's planner observation: joint positions relative to the default pose, and the
 limited command in units of the action."""
-START_CLEARANCE = 0.005
-"""Height of the soles above the ground when an episode begins [m]."""
 
 
 @dataclass(frozen=True)
@@ -108,14 +98,18 @@ class CommandEnvironment:
         seed: int = 0,
         physics: PhysicsConfig | None = None,
     ) -> None:
-        if num_envs < 1:
-            raise PilotError(f"the number of environments is {num_envs}, but it must be at least 1")
         self.task = task
         given = controller if isinstance(controller, Controller) else Controller.load(controller)
         self.controller = given.twin(num_envs)
-        self.physics = PhysicsConfig() if physics is None else physics
-        self.terrain = Terrain(TerrainConfig())
-        self.simulation = self._build_simulation(num_envs)
+        physics = PhysicsConfig() if physics is None else physics
+        options = ModelOptions(
+            gains=self.controller.gains,
+            timestep=physics.timestep,
+            elliptic_friction=True,
+            solver_iterations=physics.solver_iterations,
+        )
+        self.world = World(options, TerrainConfig(), num_envs, physics.num_threads, add_objects=task.add_to)
+        self.simulation = self.world.simulation
         self.control_period = self.simulation.control_period
         self.action_map = ActionMap(task.action, self.control_period)
         self.decision_period = task.action.decision_steps * self.control_period
@@ -138,24 +132,6 @@ class CommandEnvironment:
     def num_envs(self) -> int:
         return self.simulation.num_robots
 
-    def _build_simulation(self, num_envs: int) -> BatchSimulation:
-        config, physics = self.controller.config, self.physics
-        options = ModelOptions(
-            gains=self.controller.gains,
-            timestep=physics.timestep,
-            elliptic_friction=True,
-            solver_iterations=physics.solver_iterations,
-        )
-        spec = build_spec(options)
-        self.terrain.add_to(spec)
-        self.task.add_to(spec)
-        decimation = round(config.control_period / physics.timestep)
-        if abs(decimation * physics.timestep - config.control_period) > 1e-9:
-            raise PilotError(
-                f"the physics step {physics.timestep} s does not divide the control period {config.control_period} s"
-            )
-        return BatchSimulation(spec.compile(), num_envs, decimation, physics.num_threads)
-
     # -- episodes --------------------------------------------------------------------------------------------
 
     @torch.no_grad()
@@ -175,24 +151,15 @@ class CommandEnvironment:
 
     def _begin(self, ids: Tensor) -> None:
         """Start the current episode number of robots ``ids`` (n,)."""
-        count = len(ids)
-        neutral = self.controller.config.command_space.neutral().repeat(count, 1)
-        pose = self.controller.pose
-        joints = self._default.repeat(count, 1)
-        joints[:, LOWER_JOINTS] = pose.lookup(neutral[:, POSTURE])[0]
-        everything_zero = torch.zeros(count, 3)
-        self.simulation.reset(ids, everything_zero, about_axis(2, torch.zeros(count)), joints)
+        neutral = self.controller.config.command_space.neutral().repeat(len(ids), 1)
+        self.simulation.restart(ids)
         start = self.task.reset(ids, self.seed, self.episode[ids])
-        ground = self.terrain.height(start.position)
-        base = torch.cat([start.position, (ground + neutral[:, HEIGHT] + START_CLEARANCE)[:, None]], -1)
-        orientation = multiply(about_axis(2, start.heading), conjugate(_waist_rotation(joints[:, WAIST_JOINTS])))
-        self.simulation.set_object_pose(ids, PELVIS_BODY, torch.cat([base, orientation], -1))
-        self.simulation.forward(ids)
+        self.world.stand(ids, start.position, start.heading, neutral)
         self.controller.reset(self.num_envs, ids)
         self.command = self.command.clone()
         self.command[ids] = neutral
         self.decisions[ids] = 0
-        self.measured = measure(self.simulation.read(), self.terrain)
+        self.measured = self.world.measure()
 
     # -- stepping --------------------------------------------------------------------------------------------
 
@@ -232,12 +199,12 @@ class CommandEnvironment:
             failures.update({robot: names[robot] for robot in torch.nonzero(these)[:, 0].tolist()})
 
         # The planner and the elevation map share their rate of 10 Hz.
-        elevation = self.terrain.elevation_map(self.measured.robot.base_position, self.measured.heading)
+        elevation = self.world.elevation(self.measured)
         for number in range(1, steps + 1):
             command = interpolate(previous, goal, number / steps)
-            self.simulation.step(self.controller.act(_proprioception(self.measured), elevation, command, self._flag))
-            self.measured = measure(self.simulation.read(), self.terrain)
-            falls = has_fallen(self.measured) | self.simulation.diverged()
+            targets = self.controller.act(self.measured.proprioception, elevation, command, self._flag)
+            self.measured = self.world.advance(targets)
+            falls = self.world.fallen(self.measured)
             outcome = self.task.step(self.measured, decision)
             reward += torch.where(ended, 0.0, torch.where(falls, self.task.fall_penalty, outcome.reward))
             now = (falls | outcome.success | outcome.failure) & ~ended
@@ -300,16 +267,3 @@ class CommandEnvironment:
         )
         require_finite("observation", observation)
         return observation
-
-
-def _proprioception(measured: Measurement) -> Proprioception:
-    robot = measured.robot
-    return Proprioception(
-        robot.joint_position, robot.joint_velocity, robot.base_angular_velocity, measured.projected_gravity
-    )
-
-
-def _waist_rotation(waist: Tensor) -> Tensor:
-    """Torso relative to pelvis (n, 4) for waist joints (n, 3): yaw, then roll, then pitch."""
-    yaw, roll, pitch = waist.unbind(-1)
-    return multiply(multiply(about_axis(2, yaw), about_axis(0, roll)), about_axis(1, pitch))

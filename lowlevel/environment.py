@@ -14,7 +14,6 @@ from lowlevel.commands import (
     HEIGHT,
     KINDS,
     PROTOCOL,
-    TORSO,
     VELOCITY,
     CommandSampler,
     Mixture,
@@ -23,6 +22,7 @@ from lowlevel.commands import (
     shares,
 )
 from lowlevel.control.observation import (
+    MAP_REFRESH_STEPS,
     PRIVILEGED_SIZE,
     FrameBuilder,
     NoiseConfig,
@@ -34,16 +34,13 @@ from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
 from lowlevel.world.measures import Measurement, height_error, is_lost, torso_error, velocity_error
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
-from lowlevel.world.simulation import BatchSimulation
 from lowlevel.world.snapshot import Snapshot, take_snapshot, with_rows
-from lowlevel.world.terrain import STANCE_REACH, Terrain, TerrainConfig
-from robots.errors import PilotError
-from robots.g1.constants import ARM_JOINTS, NUM_JOINTS, WAIST_JOINTS, gain_set
-from robots.g1.model import ModelOptions, build_spec
-from robots.rotations import about_axis, multiply, rotate_about_vertical
+from lowlevel.world.terrain import TerrainConfig
+from lowlevel.world.world import World
+from robots.g1.constants import ARM_JOINTS, NUM_JOINTS, gain_set
+from robots.g1.model import ModelOptions
+from robots.rotations import rotate_about_vertical
 
-MAP_REFRESH_STEPS = 5
-"""Control steps between refreshes of the elevation map: 10 Hz at 50 Hz control (paper IV-B)."""
 AVERAGING = 0.4
 """Time constant of the averaged velocity error [s]: the sway of one step is averaged out, a drift is not."""
 UNDER_WAY = 50
@@ -63,9 +60,7 @@ class EnvironmentConfig:
     num_threads: int = 2
     """Physics threads."""
     timestep: float = 0.02 / 3
-    """Physics step [s]."""
-    decimation: int = 3
-    """Physics steps per control step; timestep * decimation must be 0.02 s (50 Hz)."""
+    """Physics step [s]; divides the control period of 0.02 s."""
     gains: str = "stiff"
     """PD gain set, a key of robots.g1.constants.GAINS."""
     episode_length: float = 10.0
@@ -126,23 +121,13 @@ class PilotEnvironment:
     """
 
     def __init__(self, config: EnvironmentConfig, seed: int = 0, device: torch.device | str = "cpu") -> None:
-        if abs(config.timestep * config.decimation - 0.02) > 1e-9:
-            raise PilotError(
-                f"timestep {config.timestep} s times decimation {config.decimation} is not the control period 0.02 s"
-            )
-        for name in ("num_robots", "num_threads"):
-            if getattr(config, name) < 1:
-                raise PilotError(f"{name} must be at least 1, not {getattr(config, name)}")
         self.config = config
         self.device = torch.device(device)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
-        self.terrain = Terrain(config.terrain, device)
         gains = gain_set(config.gains)
-        spec = build_spec(ModelOptions(gains=gains, timestep=config.timestep))
-        self.terrain.add_to(spec)
-        self.simulation = BatchSimulation(
-            spec.compile(), config.num_robots, config.decimation, config.num_threads, device
-        )
+        options = ModelOptions(gains=gains, timestep=config.timestep)
+        self.world = World(options, config.terrain, config.num_robots, config.num_threads, device)
+        self.simulation = self.world.simulation
         self.control_period = self.simulation.control_period
         self.max_steps = round(config.episode_length / self.control_period)
         lower, upper = self.simulation.joint_lower, self.simulation.joint_upper
@@ -180,7 +165,7 @@ class PilotEnvironment:
                 self.max_steps, (self.num_robots,), generator=self.generator, device=self.device
             )
         self._advance_reference()
-        now = take_snapshot(self.simulation.read(), self.terrain)
+        now = take_snapshot(self.world)
         return self._observe(now, everyone)
 
     def step(self, action: Tensor) -> StepResult:
@@ -195,7 +180,7 @@ class PilotEnvironment:
             target = target + self.config.gait_prior * self.prior(buffers.reference)
         self.simulation.step(self.randomizer.delayed(target))
 
-        now = take_snapshot(self.simulation.read(), self.terrain)
+        now = take_snapshot(self.world)
         measured = now.measured
         if self.config.gait_prior > 0.0:
             walks = is_walking(buffers.reference.command) & (buffers.episode_step > UNDER_WAY)
@@ -230,7 +215,7 @@ class PilotEnvironment:
         done = torch.nonzero(fallen | truncated)[:, 0]
         if len(done):
             self._reset_robots(done)
-            now = with_rows(now, done, take_snapshot(self.simulation.read(done), self.terrain))
+            now = with_rows(now, done, take_snapshot(self.world, done))
         buffers.hand_force = self.randomizer.disturb(now.measured.robot, now.measured.heading)
         commanded = self._resample_due_commands()
         self._advance_reference()
@@ -299,26 +284,19 @@ class PilotEnvironment:
             remembered[ids] = fresh
 
         heading = self._uniform(-torch.pi, torch.pi, count)
-        joint_position = self.reference.standing_joints(reference)
-        attitude = self.reference.pelvis_attitude(reference[:, TORSO], joint_position[:, WAIST_JOINTS])
-        orientation = multiply(about_axis(2, heading), attitude)
-        height = reference[:, HEIGHT]
-        joint_position += self._uniform(-0.02, 0.02, count, NUM_JOINTS)
-
-        tile = torch.randint(len(self.terrain.tile_centers), (count,), generator=self.generator, device=self.device)
+        joint_spread = self._uniform(-0.02, 0.02, count, NUM_JOINTS)
+        centers = self.world.terrain.tile_centers
+        tile = torch.randint(len(centers), (count,), generator=self.generator, device=self.device)
         reach = 0.5 * self.config.terrain.tile_size - 1.0
-        xy = self.terrain.tile_centers[tile] + self._uniform(-reach, reach, count, 2)
-        ground = self.terrain.highest(xy, STANCE_REACH)
-        base_position = torch.cat([xy, (ground + height + 0.005)[:, None]], -1)
+        xy = centers[tile] + self._uniform(-reach, reach, count, 2)
         base_velocity = torch.zeros(count, 6, device=self.device)
         fastest = self.config.randomization.start_velocity
         base_velocity[:, :3] = self._uniform(-fastest, fastest, count, 3)
         base_velocity[:, :2] += rotate_about_vertical(heading, velocity[:, :2])
-        self.simulation.reset(ids, base_position, orientation, joint_position, base_velocity)
         self.randomizer.draw(ids)
-        self.simulation.forward(ids)
-
-        self.randomizer.start(ids, joint_position)
+        self.simulation.restart(ids)
+        joints = self.world.stand(ids, xy, heading, reference, joint_spread, base_velocity)
+        self.randomizer.start(ids, joints + joint_spread)
         buffers.action[ids], buffers.previous_action[ids] = 0.0, 0.0
         buffers.foot_air_time[ids], buffers.foot_contact_time[ids] = 0.0, 0.0
         buffers.mean_velocity_error[ids] = 0.0

@@ -15,24 +15,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lowlevel.commands import COMMAND_SIZE, HEIGHT, POSTURE
-from lowlevel.control.controller import Controller, Proprioception
+from lowlevel.commands import COMMAND_SIZE
+from lowlevel.control.controller import Controller
 from lowlevel.control.elevation_map import MAP_SIZE
-from lowlevel.control.observation import NoiseConfig
-from lowlevel.environment import MAP_REFRESH_STEPS
-from lowlevel.world.measures import Measurement, has_fallen, measure
+from lowlevel.control.observation import MAP_REFRESH_STEPS, NoiseConfig
+from lowlevel.world.measures import Measurement
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
-from lowlevel.world.simulation import BatchSimulation
-from lowlevel.world.terrain import Terrain, TerrainConfig
-from robots.errors import PilotError
-from robots.g1.constants import DEFAULT_POSITION, LOWER_JOINTS, NUM_JOINTS, joint_index
-from robots.g1.model import ModelOptions, build_spec
-from robots.rotations import from_roll_pitch_yaw
+from lowlevel.world.terrain import TerrainConfig
+from lowlevel.world.world import World
+from robots.g1.constants import NUM_JOINTS
+from robots.g1.model import ModelOptions
 
 BATCH = 32
 """Robots side by side. The last digits of a matrix product, and with them a fall, depend on its row count."""
-TIMESTEP, DECIMATION = 0.002, 10
-"""Physics step [s] and physics steps per control step of the evaluation protocol."""
 START_SPREAD = 1.0
 """Largest distance of a start from its tile's centre, per axis [m]."""
 JOINT_SPREAD = 0.02
@@ -166,14 +161,9 @@ class Arena:
     ) -> None:
         self.controller = controller
         self.batch = batch
-        self.terrain = Terrain(terrain)
-        spec = build_spec(ModelOptions(gains=controller.gains, timestep=TIMESTEP))
-        self.terrain.add_to(spec)
-        self.simulation = BatchSimulation(spec.compile(), batch, DECIMATION, num_threads)
+        self.world = World(ModelOptions(gains=controller.gains), terrain, batch, num_threads)
+        self.simulation = self.world.simulation
         self.period = self.simulation.control_period
-        expected = controller.config.control_period
-        if abs(self.period - expected) > 1e-9:
-            raise PilotError(f"the controller runs every {expected} s, the evaluation every {self.period} s")
         drawn = RandomizationConfig.for_evaluation() if conditions is None else conditions
         self._randomizer = Randomizer(drawn, self.simulation, torch.Generator())
         self._proprioception_noise = noise.frame_amplitude()
@@ -202,7 +192,7 @@ class Arena:
         frame_noise, map_noise, starting = self._start(episodes)
         self.controller.reset(self.batch)
         up = torch.ones(self.batch, dtype=torch.bool)
-        measured = measure(self.simulation.read(), self.terrain)
+        measured = self.world.measure()
         elevation = torch.zeros(self.batch, MAP_SIZE)
         for step in range(int(lengths.max())):
             current = (starts <= step).sum(dim=1) - 1
@@ -211,7 +201,7 @@ class Arena:
                 self._stand(rising, *(values[rising] for values in starting))
                 self.controller.reset(self.batch, rising)
                 up[rising] = True
-                measured = measure(self.simulation.read(), self.terrain)
+                measured = self.world.measure()
             active = up & (step < lengths)
             waiting = stands_up & ((starts > step) & (starts < lengths[:, None])).any(dim=1) & (step < lengths)
             if not (active | waiting).any():
@@ -219,9 +209,9 @@ class Arena:
             command, flag = commands[rows, current], flags[rows, current]
             seeing = rows if step % MAP_REFRESH_STEPS == 0 else rising
             if len(seeing):
-                ground = self.terrain.elevation_map(measured.robot.base_position, measured.heading)
-                elevation[seeing] = (ground + map_noise[step // MAP_REFRESH_STEPS])[seeing]
-            proprioception = _proprioception(measured, frame_noise[step])
+                noisy = self.world.elevation(measured) + map_noise[step // MAP_REFRESH_STEPS]
+                elevation[seeing] = noisy[seeing]
+            proprioception = measured.proprioception.with_noise(frame_noise[step])
             targets = self.controller.act(proprioception, elevation, command, flag)
             failed = active & ~torch.isfinite(targets).all(dim=1)
             if step in pushes:
@@ -233,8 +223,8 @@ class Arena:
             moving = torch.nonzero(active & ~failed)[:, 0]
             applied = self._randomizer.delayed(torch.nan_to_num(targets))
             work = self.simulation.step_with_work(applied, moving)
-            measured = measure(self.simulation.read(), self.terrain)
-            fell = active & ~failed & (has_fallen(measured) | self.simulation.diverged())
+            measured = self.world.measure()
+            fell = active & ~failed & self.world.fallen(measured)
             yield Moment(
                 step=step,
                 measured=measured,
@@ -318,26 +308,20 @@ class Arena:
                 frame_noise[when, row] = self._proprioception_noise * noise[: when.stop - when.start]
                 map_noise[refresh, row] = self._elevation_noise * _symmetric(generator, MAP_SIZE)
             tiles[row] = episode.tile
-        starting = self.terrain.tile_centers[tiles] + START_SPREAD * place[:, :2], torch.pi * place[:, 2], joint_spread
+        starting = (
+            self.world.terrain.tile_centers[tiles] + START_SPREAD * place[:, :2],
+            torch.pi * place[:, 2],
+            joint_spread,
+        )
         self._stand(torch.arange(self.batch), *starting)
         return frame_noise, map_noise, starting
 
     def _stand(self, ids: Tensor, xy: Tensor, heading: Tensor, joint_spread: Tensor) -> None:
         """Put robots ``ids`` (n,) at rest in the nominal pose of the neutral command, feet just above the ground."""
-        count = len(ids)
-        zeros = torch.zeros(count)
-        neutral = self.controller.config.command_space.neutral().repeat(count, 1)
-        joints = torch.tensor(DEFAULT_POSITION, dtype=torch.float32).repeat(count, 1)
-        joints[:, LOWER_JOINTS] = self.controller.pose.lookup(neutral[:, POSTURE]).position
-        pelvis_pitch = -joints[:, joint_index("waist_pitch_joint")]
-        orientation = from_roll_pitch_yaw(torch.stack([zeros, pelvis_pitch, heading], -1))
-        on_ground = torch.cat([xy, zeros[:, None]], -1)
-        highest_ground = -self.terrain.elevation_map(on_ground, heading).amin(dim=1)
-        height = highest_ground + neutral[:, HEIGHT] + 0.005
-        position = torch.cat([xy, height[:, None]], -1)
-        self.simulation.reset(ids, position, orientation, joints + joint_spread)
+        neutral = self.controller.config.command_space.neutral().repeat(len(ids), 1)
+        self.simulation.restart(ids)
+        joints = self.world.stand(ids, xy, heading, neutral, joint_spread)
         self._randomizer.start(ids, joints)
-        self.simulation.forward(ids)
 
 
 def run_all(
@@ -376,11 +360,3 @@ def batch_steps(arena: Arena, episodes: Sequence[Episode]) -> int:
 def _symmetric(generator: torch.Generator, *shape: int) -> Tensor:
     """Uniform numbers in [-1, 1]."""
     return 2.0 * torch.rand(*shape, generator=generator) - 1.0
-
-
-def _proprioception(measured: Measurement, noise: Tensor) -> Proprioception:
-    """Measurements with ``noise`` (N, 64) added, in the order of the observation frame."""
-    robot = measured.robot
-    base = (robot.base_angular_velocity, measured.projected_gravity)
-    clean = torch.cat([robot.joint_position, robot.joint_velocity, *base], -1)
-    return Proprioception(*(clean + noise).split([NUM_JOINTS, NUM_JOINTS, 3, 3], dim=-1))

@@ -8,6 +8,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
+from lowlevel.control.observation import CONTROL_PERIOD
 from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS, gain_set
 from robots.g1.model import ModelOptions, build_spec
 
@@ -18,15 +19,14 @@ class PlainMujocoEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Args:
         gains: gain set of the actuators.
         timestep: physics step [s].
-        decimation: physics steps per control step.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's interface)
 
-    def __init__(self, gains: str, timestep: float, decimation: int) -> None:
+    def __init__(self, gains: str, timestep: float) -> None:
         self._model = build_spec(ModelOptions(gains=gain_set(gains), timestep=timestep)).compile()
         self._data = mujoco.MjData(self._model)
-        self._decimation = decimation
+        self._decimation = round(CONTROL_PERIOD / timestep)
         size = self._model.nq + self._model.nv
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (NUM_JOINTS,), np.float32)

@@ -60,57 +60,27 @@ def measure_training(trainer: Trainer, updates: int, name: str) -> dict[str, Fig
     }
 
 
-class _TimedSimulation:
-    """A simulation that adds up the time that MuJoCo takes: for steps, and for the constants and states of resets."""
-
-    def __init__(self, simulation: Any) -> None:
-        self._simulation = simulation
-        self.step_seconds = self.reset_seconds = 0.0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._simulation, name)
-
-    def step(self, targets: torch.Tensor) -> None:
-        began = time.perf_counter()
-        self._simulation.step(targets)
-        self.step_seconds += time.perf_counter() - began
-
-    def forward(self, ids: torch.Tensor | None = None) -> None:
-        began = time.perf_counter()
-        self._simulation.forward(ids)
-        self.reset_seconds += time.perf_counter() - began
-
-    def update_constants(self, ids: torch.Tensor) -> None:
-        began = time.perf_counter()
-        self._simulation.update_constants(ids)
-        self.reset_seconds += time.perf_counter() - began
-
-
 def measure_environment(environment: PilotEnvironment, seconds: float) -> dict[str, Figure]:
     """The environment with zero actions, physics steps alone as seen from within it, and what is not MuJoCo's."""
     count = environment.num_robots
     action = torch.zeros(count, NUM_JOINTS)
     simulation = environment.simulation
-    timed = _TimedSimulation(simulation)
-    environment.simulation = environment.randomizer.simulation = timed  # type: ignore[assignment]
 
     def step() -> int:
         environment.step(action)
         return count
 
     environment_rates, physics_rates, shares = [], [], []
-    try:
-        for _ in range(WINDOWS):
-            step()
-            timed.step_seconds, timed.reset_seconds = 0.0, 0.0
-            done, began = 0, time.perf_counter()
-            while (elapsed := time.perf_counter() - began) < seconds / WINDOWS or not done:
-                done += step()
-            environment_rates.append(done / elapsed)
-            physics_rates.append(done / timed.step_seconds)
-            shares.append(1.0 - (timed.step_seconds + timed.reset_seconds) / elapsed)
-    finally:
-        environment.simulation = environment.randomizer.simulation = simulation
+    for _ in range(WINDOWS):
+        step()
+        stepped, reset = simulation.step_seconds, simulation.reset_seconds
+        done, began = 0, time.perf_counter()
+        while (elapsed := time.perf_counter() - began) < seconds / WINDOWS or not done:
+            done += step()
+        stepping, resetting = simulation.step_seconds - stepped, simulation.reset_seconds - reset
+        environment_rates.append(done / elapsed)
+        physics_rates.append(done / stepping)
+        shares.append(1.0 - (stepping + resetting) / elapsed)
     return {
         "physics_steps_per_second": mean_figure(physics_rates, "1/s"),
         "environment_steps_per_second": mean_figure(environment_rates, "1/s"),
@@ -121,7 +91,7 @@ def measure_environment(environment: PilotEnvironment, seconds: float) -> dict[s
 def plain_rates(config: TrainingConfig, processes: int, seconds: float) -> list[float]:
     """Control steps per second of one plain environment per process."""
     environment = config.environment
-    make = partial(PlainMujocoEnv, environment.gains, environment.timestep, environment.decimation)
+    make = partial(PlainMujocoEnv, environment.gains, environment.timestep)
     return _subproc_rates([make] * processes, seconds)
 
 

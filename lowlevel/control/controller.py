@@ -24,7 +24,15 @@ from lowlevel.commands import CommandSpace, clamp_posture
 from lowlevel.control.control_step import ControlStep, Memory
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.golden import GOLDEN_ROBOTS, golden_vectors
-from lowlevel.control.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, Proprioception, columns, normalised_columns
+from lowlevel.control.observation import (
+    CONTROL_PERIOD,
+    FRAME,
+    FRAME_SIZE,
+    HISTORY_LENGTH,
+    Proprioception,
+    columns,
+    normalised_columns,
+)
 from lowlevel.control.onnx_step import OnnxStep, export_step
 from lowlevel.control.reference import Reference, ReferenceConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes, PilotActor
@@ -204,6 +212,10 @@ class Controller:
         config, provenance = _FOLDER.read_config(folder, ControllerConfig)
         if config.joint_names != JOINT_NAMES:
             raise ControllerError(f"{folder / CONFIG_FILE} is for a robot with other joints or another joint order")
+        if abs(config.control_period - CONTROL_PERIOD) > 1e-9:
+            raise ControllerError(
+                f"{folder / CONFIG_FILE} is for a control period of {config.control_period} s, not {CONTROL_PERIOD} s"
+            )
         if runtime not in ("onnx", "torch"):
             raise ControllerError(f"there is no runtime {runtime!r}: use 'onnx' or 'torch'")
         step = _read_onnx(folder, device) if runtime == "onnx" else _read_policy(folder, config, device)

@@ -20,6 +20,10 @@ from lowlevel.control.reference import Reference, ReferenceState
 from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS
 from robots.g1.mirror import AXIAL_VECTOR, JOINTS_MIRROR, VECTOR, Mirror, concatenate, signs
 
+CONTROL_PERIOD = 0.02
+"""Time between two observations, and between the actions that they lead to [s]: 50 Hz (paper IV-B)."""
+MAP_REFRESH_STEPS = 5
+"""Control steps between refreshes of the elevation map: 10 Hz (paper IV-B)."""
 HISTORY_LENGTH = 5
 """Past frames beside the current one (paper: H = 5)."""
 NOMINAL_MAP_DISTANCE = 0.75
@@ -106,6 +110,16 @@ class Proprioception:
     """(N, 3) [rad/s], pelvis frame."""
     projected_gravity: Tensor
     """Unit gravity direction in the pelvis frame (N, 3); (0, 0, -1) when upright."""
+
+    def with_noise(self, noise: Tensor) -> Proprioception:
+        """Measurements with ``noise`` (N, 64) added, in the order of the fields."""
+        joints, velocities, turning, gravity = noise.split([NUM_JOINTS, NUM_JOINTS, 3, 3], dim=-1)
+        return Proprioception(
+            self.joint_position + joints,
+            self.joint_velocity + velocities,
+            self.base_angular_velocity + turning,
+            self.projected_gravity + gravity,
+        )
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,6 @@ from lowlevel.commands import (
 from robots.g1.arm_mass import ArmMass
 from robots.g1.constants import ARM_JOINTS, LOWER_JOINTS, Gains
 from robots.g1.nominal_pose import NominalPose
-from robots.rotations import about_axis, conjugate, from_roll_pitch_yaw, multiply
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -148,19 +147,6 @@ class Reference:
         arms = state.command[:, ARMS]
         torque = self._arm_mass.holding_torque(arms, _gravity_in_torso(state.command[:, TORSO]))
         return torch.cat([lower, arms + torque * self._arm_compliance], dim=1)
-
-    def standing_joints(self, command: Tensor) -> Tensor:
-        """Joint positions (N, 29) [rad] in which a robot holds the posture and arms of ``command`` (N, 21)."""
-        return torch.cat([self.pose.lookup(command[:, POSTURE]).position, command[:, ARMS]], dim=1)
-
-    def pelvis_attitude(self, torso: Tensor, waist: Tensor) -> Tensor:
-        """Pelvis quaternion (N, 4) in the heading frame that puts the torso at ``torso`` (N, 3; roll, pitch, yaw).
-
-        ``waist`` (N, 3): waist joints in the order of the joint table, yaw, roll, pitch [rad].
-        """
-        yaw, roll, pitch = waist.unbind(-1)
-        tilted = multiply(about_axis(0, roll), about_axis(1, pitch))
-        return multiply(from_roll_pitch_yaw(torso), conjugate(multiply(about_axis(2, yaw), tilted)))
 
 
 def _gravity_in_torso(torso: Tensor) -> Tensor:

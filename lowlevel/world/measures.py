@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
+from lowlevel.control.observation import Proprioception
 from lowlevel.world.simulation import RobotState
 from lowlevel.world.terrain import Terrain
 from robots.g1.constants import ARM_JOINTS, BODY_POINTS
@@ -50,6 +51,14 @@ class Measurement:
     """Loaded feet (N, 2), boolean."""
     body_clearance: Tensor
     """Centres of the robot's body points above the ground below them (N, 7) [m]."""
+
+    @property
+    def proprioception(self) -> Proprioception:
+        """What the robot's own sensors would measure, without noise."""
+        robot = self.robot
+        return Proprioception(
+            robot.joint_position, robot.joint_velocity, robot.base_angular_velocity, self.projected_gravity
+        )
 
 
 def measure(robot: RobotState, terrain: Terrain) -> Measurement:

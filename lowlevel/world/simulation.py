@@ -8,6 +8,7 @@ forces) are one physics substep old, as after any ``mj_step``.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -97,6 +98,10 @@ class BatchSimulation:
             for i in range(model.nsensor)
         }
         self._per_robot_fields: dict[str, np.ndarray] = {}
+        self.step_seconds = 0.0
+        """Time that MuJoCo has taken for steps [s]."""
+        self.reset_seconds = 0.0
+        """Time that MuJoCo has taken for the constants and derived quantities of robots that were reset [s]."""
         self._diverged = np.zeros(num_robots, dtype=bool)
 
     def _free_joint_slices(self, body: str) -> tuple[slice, slice]:
@@ -149,7 +154,9 @@ class BatchSimulation:
         Robots whose state is not finite afterwards return to the model's initial state; see :meth:`diverged`.
         """
         self._ctrl[:, self._actuators] = targets.detach().cpu().numpy()
+        began = time.perf_counter()
         self._batch.step(nstep=self.decimation)
+        self.step_seconds += time.perf_counter() - began
         self._find_diverged()
 
     def step_with_work(self, targets: Tensor, ids: Tensor) -> Tensor:
@@ -178,9 +185,15 @@ class BatchSimulation:
 
     def forward(self, ids: Tensor | None = None) -> None:
         """Recompute the derived quantities of ``ids`` (all by default) without advancing time."""
+        began = time.perf_counter()
         self._batch.forward(None if ids is None else ids.cpu().numpy())
+        self.reset_seconds += time.perf_counter() - began
 
-    def reset(
+    def restart(self, ids: Tensor) -> None:
+        """Put everything in the scenes of ``ids`` (n,) into the model's initial state; :meth:`place` robots next."""
+        self._batch.reset(ids.cpu().numpy(), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+
+    def place(
         self,
         ids: Tensor,
         base_position: Tensor,
@@ -190,12 +203,10 @@ class BatchSimulation:
     ) -> None:
         """Put robots ``ids`` (n,) into a state, at rest unless ``base_velocity`` (n, 6) is given.
 
-        Objects return to the model's initial state. Call :meth:`forward` when all writes are done.
+        Call :meth:`forward` when all writes are done.
         """
         rows = ids.cpu().numpy()
-        self._batch.reset(rows, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
-        pose = torch.cat([base_position, base_quaternion], -1).cpu().numpy()
-        self._qpos[rows, self._base_qpos] = pose
+        self._qpos[rows, self._base_qpos] = torch.cat([base_position, base_quaternion], -1).cpu().numpy()
         self._qpos[rows, self._joint_qpos] = joint_position.cpu().numpy()
         self._ctrl[rows, self._actuators] = joint_position.cpu().numpy()
         if base_velocity is not None:
@@ -229,7 +240,9 @@ class BatchSimulation:
 
     def update_constants(self, ids: Tensor) -> None:
         """Recompute what MuJoCo derives from masses and sizes, after :meth:`per_robot` writes."""
+        began = time.perf_counter()
         self._batch.set_const(ids.cpu().numpy())
+        self.reset_seconds += time.perf_counter() - began
 
     def diverged(self) -> Tensor:
         """Robots whose state was not finite after the last :meth:`step` (N,)."""

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from lowlevel.control.observation import map_observation
-from lowlevel.world.measures import Measurement, measure
+from lowlevel.world.measures import Measurement
 from lowlevel.world.simulation import RobotState
-from lowlevel.world.terrain import Terrain
+from lowlevel.world.world import World
 from robots.rotations import rotate_about_vertical
 
 FORCE_SCALE = 400.0
@@ -34,16 +34,17 @@ class Snapshot:
     """The elevation map without noise (N, 121) [m], as observed."""
 
 
-def take_snapshot(robot: RobotState, terrain: Terrain) -> Snapshot:
-    """Derive a :class:`Snapshot` from the raw state."""
-    measured = measure(robot, terrain)
+def take_snapshot(world: World, ids: Tensor | None = None) -> Snapshot:
+    """A :class:`Snapshot` of robots ``ids`` (n,), all by default."""
+    measured = world.measure(ids)
+    robot = measured.robot
     position = robot.foot_position - robot.base_position[:, None]
     vectors = torch.cat([position, robot.foot_velocity, robot.foot_force / FORCE_SCALE], dim=1)
     turned = rotate_about_vertical(-measured.heading[:, None], vectors)
     return Snapshot(
         measured=measured,
         feet=torch.cat([measured.foot_contact.float(), measured.foot_clearance, turned.flatten(1)], dim=1),
-        elevation=map_observation(terrain.elevation_map(robot.base_position, measured.heading)),
+        elevation=map_observation(world.elevation(measured)),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -150,10 +149,3 @@ def test_bad_actions_are_refused(make_environment: Make) -> None:
     for bad in (torch.zeros(3, 21), torch.full((2, 21), float("nan"))):
         with pytest.raises(ValueError, match="finite and of shape"):
             environment.step(bad)
-
-
-def test_a_timestep_that_does_not_divide_the_control_period_is_refused(make_environment: Make) -> None:
-    environment = make_environment()
-    environment.physics = replace(environment.physics, timestep=0.003)
-    with pytest.raises(ValueError, match="does not divide"):
-        environment._build_simulation(1)

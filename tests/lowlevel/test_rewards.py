@@ -8,7 +8,7 @@ import torch
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 from lowlevel.rewards import REWARD_TERMS, RewardWeights, Transition, compute_rewards
 from lowlevel.runs.checks import NonFiniteError
-from lowlevel.world.measures import Measurement, has_fallen, is_lost, measure, stumbles, torso_error
+from lowlevel.world.measures import Measurement, has_fallen, is_lost, stumbles, torso_error
 from robots.rotations import from_roll_pitch_yaw
 
 
@@ -20,7 +20,7 @@ def standing() -> Transition:
     command = environment.command_space.neutral().repeat(4, 1)
     zeros = torch.zeros(4, 29)
     return Transition(
-        measured=measure(environment.simulation.read(), environment.terrain),
+        measured=environment.world.measure(),
         command=command,
         flag=torch.ones(4, 1),
         action=zeros,

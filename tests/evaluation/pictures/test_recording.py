@@ -24,7 +24,7 @@ def arena(untrained_controller: Path) -> Arena:
 
 @pytest.fixture(scope="module")
 def twin(arena: Arena) -> VisualTwin:
-    return VisualTwin(arena.terrain.add_to)
+    return VisualTwin(arena.world.terrain.add_to)
 
 
 def by_entity(path: Path) -> dict[str, list[Chunk]]:
@@ -118,9 +118,9 @@ def test_map_points_lie_on_the_ground(arena: Arena) -> None:
     neutral = arena.controller.config.command_space.neutral()
     (moment,) = list(arena.run([constant(1, 0.02, neutral, flag=1.0)]))
     measured = moment.measured
-    exact = arena.terrain.elevation_map(measured.robot.base_position, measured.heading)
+    exact = arena.world.elevation(measured)
     points = map_points(measured, exact)[0]
-    ground = arena.terrain.height(points[:, :2])
+    ground = arena.world.terrain.height(points[:, :2])
     assert ground.max() > 0.01
     np.testing.assert_allclose(points[:, 2], ground, atol=1e-5)
     center = points[60]

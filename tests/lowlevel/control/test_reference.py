@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY, CommandSpace, command_space
+from lowlevel.commands import ARMS, HEIGHT, POSTURE, TORSO, VELOCITY, CommandSpace, command_space
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
+from lowlevel.world.world import pelvis_attitude
 from robots.g1.constants import GAINS, NUM_JOINTS, WAIST_JOINTS, joint_index
 from robots.g1.mirror import JOINTS_MIRROR
 from robots.g1.model import build_spec, joint_limits
@@ -107,26 +108,6 @@ def test_a_robot_stops_before_it_squats_and_stands_up_before_it_walks(
     assert (True, True) not in seen
 
 
-def test_the_pelvis_attitude_puts_the_torso_where_it_is_told(reference: Reference, space: CommandSpace) -> None:
-    """Against MuJoCo's kinematics of the whole robot."""
-    model = build_spec().compile()
-    data = mujoco.MjData(model)
-    command = space.neutral().repeat(4, 1)
-    command[:, HEIGHT] = torch.tensor([0.76, 0.6, 0.5, 0.45])
-    command[:, TORSO] = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.4, -0.6], [-0.1, 0.9, 0.3], [0.0, 1.2, 0.0]])
-    command = reference.clamp(command)
-    joints = reference.standing_joints(command)
-    attitude = reference.pelvis_attitude(command[:, TORSO], joints[:, WAIST_JOINTS])
-    for row in range(4):
-        data.qpos[3:7], data.qpos[7:] = attitude[row].numpy(), joints[row].numpy()
-        mujoco.mj_kinematics(model, data)
-        roll, pitch, yaw = command[row, TORSO].tolist()
-        rotation = data.body("torso_link").xmat.reshape(3, 3)
-        assert math.atan2(rotation[2, 1], rotation[2, 2]) == pytest.approx(roll, abs=1e-5)
-        assert -math.asin(rotation[2, 0]) == pytest.approx(pitch, abs=1e-5)
-        assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(yaw, abs=1e-5)
-
-
 def test_arm_targets_lead_by_what_gravity_would_make_them_sag(reference: Reference, space: CommandSpace) -> None:
     """Against MuJoCo's gravity torques in a bent posture."""
     model = build_spec().compile()
@@ -135,9 +116,9 @@ def test_arm_targets_lead_by_what_gravity_would_make_them_sag(reference: Referen
     command[0, HEIGHT], command[0, TORSO.start + 1] = 0.55, 0.8
     command[0, ARMS] += 0.3
     command = reference.clamp(command)
-    joints = reference.standing_joints(command)
-    data.qpos[3:7] = reference.pelvis_attitude(command[:, TORSO], joints[:, WAIST_JOINTS])[0].numpy()
-    data.qpos[7:] = joints[0].numpy()
+    lower = reference.pose.lookup(command[:, POSTURE]).position
+    data.qpos[3:7] = pelvis_attitude(command[:, TORSO], lower[:, WAIST_JOINTS])[0].numpy()
+    data.qpos[7:] = torch.cat([lower, command[:, ARMS]], dim=1)[0].numpy()
     mujoco.mj_forward(model, data)
     lead = reference.joint_targets(ReferenceState.standing(command))[0, 15:] - command[0, ARMS]
     torque = lead.numpy() * GAINS["stiff"].stiffness[15:]
