@@ -44,6 +44,11 @@ class CommandSpace:
         """Lower and upper bounds, each (21,)."""
         return torch.tensor(self.lower, device=device), torch.tensor(self.upper, device=device)
 
+    def scaled(self, command: Tensor) -> Tensor:
+        """``command`` (N, 21) with each number's bounds at -1 and 1."""
+        lower, upper = self.bounds(command.device)
+        return (command - 0.5 * (upper + lower)) / (0.5 * (upper - lower))
+
     def neutral(self, device: torch.device | str = "cpu") -> Tensor:
         """Stand upright at full height with the arms at the default pose (21,)."""
         command = torch.zeros(COMMAND_SIZE, device=device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, TypeVar
 
 import torch
@@ -22,19 +22,20 @@ from lowlevel.commands import (
     shares,
 )
 from lowlevel.control.observation import (
+    FRAME,
     MAP_REFRESH_STEPS,
-    PRIVILEGED_SIZE,
-    FrameBuilder,
     NoiseConfig,
+    build,
+    map_observation,
     push_history,
     start_history,
 )
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
+from lowlevel.privileged import PRIVILEGED, PrivilegedView
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
-from lowlevel.world.measures import Measurement, height_error, is_lost, torso_error, velocity_error
+from lowlevel.world.measures import Measurement, is_lost, velocity_error, with_rows
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
-from lowlevel.world.snapshot import Snapshot, take_snapshot, with_rows
 from lowlevel.world.terrain import TerrainConfig
 from lowlevel.world.world import World
 from robots.g1.constants import ARM_JOINTS, NUM_JOINTS, gain_set
@@ -136,13 +137,12 @@ class PilotEnvironment:
         self.reference = Reference(config.reference, gains, self.control_period, device)
         self.prior = GaitPrior(config.prior, device)
         self.action_scale = torch.tensor(gains.action_scale, dtype=torch.float32, device=device)
-        self.build_frame = FrameBuilder(self.command_space, self.reference, device)
         self.randomizer = Randomizer(config.randomization, self.simulation, self.generator)
         self.kind_probability = shares(config.mixture, device)
         """Chance of each kind of command (kinds,); the curriculum moves it."""
         self.opening = torch.ones(len(KINDS), device=device)
         """How far each kind is open (kinds,), in [0, 1]; the curriculum moves it."""
-        self._noise = config.noise.frame_amplitude().to(device)
+        self._noise = config.noise.proprioception().to(device)
         self._step_count = 0
         neutral = self.command_space.neutral(self.device)
         self.buffers = Buffers.empty(neutral.repeat(config.num_robots, 1))
@@ -165,8 +165,8 @@ class PilotEnvironment:
                 self.max_steps, (self.num_robots,), generator=self.generator, device=self.device
             )
         self._advance_reference()
-        now = take_snapshot(self.world)
-        return self._observe(now, everyone)
+        measured = self.world.measure()
+        return self._observe(measured, self._seen_ground(measured), everyone)
 
     def step(self, action: Tensor) -> StepResult:
         """Apply residual ``action`` (N, 29), in action scales, for one control step of 0.02 s."""
@@ -178,10 +178,8 @@ class PilotEnvironment:
         target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
         if self.config.gait_prior > 0.0:
             target = target + self.config.gait_prior * self.prior(buffers.reference)
-        self.simulation.step(self.randomizer.delayed(target))
-
-        now = take_snapshot(self.world)
-        measured = now.measured
+        measured = self.world.advance(self.randomizer.delayed(target))
+        ground = self._seen_ground(measured)
         if self.config.gait_prior > 0.0:
             walks = is_walking(buffers.reference.command) & (buffers.episode_step > UNDER_WAY)
             walked = torch.cat([measured.linear_velocity[:, :2], measured.yaw_rate[:, None]], dim=1)
@@ -210,18 +208,20 @@ class PilotEnvironment:
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
         command, kind = buffers.command, buffers.kind.clone()
-        next_privileged = self._privileged(now, self._frame(measured), transition.torso_error)
+        next_privileged = build(PRIVILEGED, self._view(measured, ground))
 
-        done = torch.nonzero(fallen | truncated)[:, 0]
+        done, now = torch.nonzero(fallen | truncated)[:, 0], measured
         if len(done):
             self._reset_robots(done)
-            now = with_rows(now, done, take_snapshot(self.world, done))
-        buffers.hand_force = self.randomizer.disturb(now.measured.robot, now.measured.heading)
+            fresh = self.world.measure(done)
+            now = with_rows(measured, done, fresh)
+            ground = ground.index_copy(0, done, self._seen_ground(fresh))
+        buffers.hand_force = self.randomizer.disturb(now.robot, now.heading)
         commanded = self._resample_due_commands()
         self._advance_reference()
         self._step_count += 1
         return StepResult(
-            observation=self._observe(now, done),
+            observation=self._observe(now, ground, done),
             reward=reward,
             terminated=fallen,
             truncated=truncated,
@@ -304,59 +304,47 @@ class PilotEnvironment:
 
     # -- observation ------------------------------------------------------------------------------------------
 
-    def _frame(self, measured: Measurement) -> Tensor:
-        robot, buffers = measured.robot, self.buffers
-        return self.build_frame(
-            robot.joint_position + self.randomizer.state.joint_offset,
-            robot.joint_velocity,
-            robot.base_angular_velocity,
-            measured.projected_gravity,
-            buffers.command,
-            buffers.action,
-            buffers.reference,
+    def _seen_ground(self, measured: Measurement) -> Tensor:
+        """The elevation map as observed, without noise (n, 121) [m]."""
+        return map_observation(self.world.elevation(measured))
+
+    def _view(self, measured: Measurement, ground: Tensor) -> PrivilegedView:
+        buffers, drawn, exact = self.buffers, self.randomizer.state, measured.proprioception
+        return PrivilegedView(
+            proprioception=replace(exact, joint_position=exact.joint_position + drawn.joint_offset),
+            command=buffers.command,
+            last_action=buffers.action,
+            reference=buffers.reference,
+            space=self.command_space,
+            measured=measured,
+            elevation=ground,
+            mean_velocity_error=buffers.mean_velocity_error,
+            hand_force=buffers.hand_force,
+            flag=buffers.flag,
+            drawn=drawn,
         )
 
-    def _observe(self, now: Snapshot, new_episodes: Tensor) -> dict[str, Tensor]:
+    def _observe(self, measured: Measurement, ground: Tensor, new_episodes: Tensor) -> dict[str, Tensor]:
         """The observation, after pushing a noisy frame, restarting new histories and refreshing the map (10 Hz)."""
-        buffers = self.buffers
-        exact_frame = self._frame(now.measured)
-        frame = exact_frame.clone()
-        frame[:, : len(self._noise)] += self._noise * self._uniform(-1.0, 1.0, self.num_robots, len(self._noise))
+        buffers, view = self.buffers, self._view(measured, ground)
+        noise = self._noise * self._uniform(-1.0, 1.0, self.num_robots, len(self._noise))
+        frame = build(FRAME, replace(view, proprioception=view.proprioception.with_noise(noise)))
         buffers.history = push_history(buffers.history, frame)
         if len(new_episodes):
             buffers.history[new_episodes] = start_history(frame[new_episodes])
         if self._step_count % MAP_REFRESH_STEPS == 0:
-            buffers.elevation = self._noisy(now.elevation)
+            buffers.elevation = self._noisy(ground)
         elif len(new_episodes):
-            buffers.elevation[new_episodes] = self._noisy(now.elevation[new_episodes])
+            buffers.elevation[new_episodes] = self._noisy(ground[new_episodes])
         return {
             "history": buffers.history.flatten(1),
             "elevation_map": buffers.elevation,
             "flag": buffers.flag.clone(),
-            "privileged": self._privileged(now, exact_frame, torso_error(now.measured, buffers.command)),
+            "privileged": build(PRIVILEGED, view),
         }
 
     def _noisy(self, elevation: Tensor) -> Tensor:
         return elevation + self.config.noise.elevation * self._uniform(-1.0, 1.0, *elevation.shape)
-
-    def _privileged(self, now: Snapshot, exact_frame: Tensor, torso_error: Tensor) -> Tensor:
-        measured, buffers = now.measured, self.buffers
-        parts = (
-            measured.linear_velocity,
-            exact_frame,
-            height_error(measured, buffers.command)[:, None],
-            torso_error,
-            buffers.mean_velocity_error,
-            now.feet,
-            buffers.hand_force.flatten(1) / 20.0,
-            self.randomizer.state.friction,
-            self.randomizer.state.added_mass,
-            buffers.flag,
-            now.elevation,
-        )
-        privileged = torch.cat(parts, dim=-1)
-        assert privileged.shape[-1] == PRIVILEGED_SIZE
-        return privileged
 
     # -- saving -----------------------------------------------------------------------------------------------
 

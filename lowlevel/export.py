@@ -11,7 +11,7 @@ import tyro
 
 from lowlevel.commands import KINDS
 from lowlevel.control.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
-from lowlevel.control.observation import FRAME, normalised_columns
+from lowlevel.control.observation import FRAME, normalized_columns
 from lowlevel.environment import PilotEnvironment
 from lowlevel.networks.actor import PilotActor
 from lowlevel.runs.command_line import command_line
@@ -51,7 +51,7 @@ def export_controller(trainer: Trainer, folder: Path, revision: str | None = Non
     environment = trainer.environment
     config, pose = controller_config(environment), environment.reference.pose
     policy = PolicyConfig(environment.config.reference, trainer.config.network, pose.axes)
-    actor = PilotActor(actor_sizes(), policy.network, ~normalised_columns(FRAME))
+    actor = PilotActor(actor_sizes(), policy.network, ~normalized_columns(FRAME))
     actor.load_state_dict({name: tensor.cpu() for name, tensor in trainer.ppo.actor.state_dict().items()})
     if not trainer.stage.arms_act:
         actor.silence(ARM_JOINTS)

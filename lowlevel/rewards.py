@@ -13,7 +13,6 @@ from lowlevel.commands import STANDING_SPEED, is_walking
 from lowlevel.runs.checks import NonFiniteError
 from lowlevel.world.measures import Measurement, arm_error, height_error, stumbles, torso_error, velocity_error
 from robots.g1.constants import EFFORT, joint_index
-from robots.rotations import rotate_about_vertical
 
 
 @dataclass(frozen=True)
@@ -148,12 +147,12 @@ def feet_air_time(t: Transition) -> Tensor:
 
 def feet_slippage(t: Transition) -> Tensor:
     """Horizontal speed of loaded feet [m/s]."""
-    return (t.measured.robot.foot_velocity[..., :2].norm(dim=-1) * t.measured.foot_contact).sum(-1)
+    return (t.measured.foot_velocity[..., :2].norm(dim=-1) * t.measured.foot_contact).sum(-1)
 
 
 def large_feet_force(t: Transition) -> Tensor:
     """Contact force beyond 1.5 times the body weight [N], at most 400 N a foot."""
-    return (t.measured.robot.foot_force.norm(dim=-1) - 500.0).clamp(0.0, 400.0).sum(-1)
+    return (t.measured.foot_force.norm(dim=-1) - 500.0).clamp(0.0, 400.0).sum(-1)
 
 
 def no_fly(t: Transition) -> Tensor:
@@ -175,8 +174,8 @@ def _lift(t: Transition) -> Tensor:
 
 def _feet_apart(t: Transition) -> Tensor:
     """Left foot minus right foot in the heading frame (N, 2) [m]."""
-    feet = t.measured.robot.foot_position[..., :2]
-    return rotate_about_vertical(-t.measured.heading, feet[:, 0] - feet[:, 1])
+    feet = t.measured.foot_position[..., :2]
+    return feet[:, 0] - feet[:, 1]
 
 
 def foot_phase(t: Transition, variance: float = 0.003) -> Tensor:

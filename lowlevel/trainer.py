@@ -19,17 +19,15 @@ from lowlevel.control.observation import (
     FRAME,
     FRAME_SIZE,
     HISTORY_LENGTH,
-    MIRRORS,
-    PRIVILEGED,
-    PRIVILEGED_SIZE,
     columns,
-    normalised_columns,
+    normalized_columns,
 )
 from lowlevel.curriculum import Curriculum, CurriculumConfig
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
 from lowlevel.gait_prior import first_stride
 from lowlevel.learning.ppo import PPO, PPOConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes
+from lowlevel.privileged import MIRRORS, PRIVILEGED, PRIVILEGED_SIZE
 from lowlevel.runs.distributed import any_rank, average_over_ranks, rank, world_size
 from lowlevel.runs.interrupts import stop_on_signals
 from lowlevel.runs.progress import ProgressReport
@@ -108,8 +106,8 @@ class Trainer:
             mirrors=MIRRORS,
             num_envs=config.environment.num_robots,
             device=config.device,
-            command_columns=~normalised_columns(FRAME),
-            privileged_command_columns=~normalised_columns(PRIVILEGED),
+            command_columns=~normalized_columns(FRAME),
+            privileged_command_columns=~normalized_columns(PRIVILEGED),
             gait_clock=columns(FRAME, "gait_clock"),
             seed=config.seed,
         )

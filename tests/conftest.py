@@ -10,7 +10,7 @@ import torch
 from evaluation.pictures.painter import NoOpenGLError, find_platform
 from lowlevel.commands import command_space
 from lowlevel.control.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
-from lowlevel.control.observation import FRAME, normalised_columns
+from lowlevel.control.observation import FRAME, normalized_columns
 from lowlevel.control.reference import ReferenceConfig
 from lowlevel.networks.actor import NetworkConfig, PilotActor
 from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
@@ -50,7 +50,7 @@ def untrained_controller(tmp_path_factory: pytest.TempPathFactory) -> Path:
         command_space=command_space(limits[:, 0].tolist(), limits[:, 1].tolist()),
     )
     policy = PolicyConfig(ReferenceConfig(), network, pose.axes)
-    actor = PilotActor(actor_sizes(), network, ~normalised_columns(FRAME))
+    actor = PilotActor(actor_sizes(), network, ~normalized_columns(FRAME))
     folder = tmp_path_factory.mktemp("controllers") / "untrained"
     save_controller(folder, config, policy, build_step(config, policy, actor, pose, "cpu"), provenance={})
     return folder

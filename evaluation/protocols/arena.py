@@ -166,7 +166,7 @@ class Arena:
         self.period = self.simulation.control_period
         drawn = RandomizationConfig.for_evaluation() if conditions is None else conditions
         self._randomizer = Randomizer(drawn, self.simulation, torch.Generator())
-        self._proprioception_noise = noise.frame_amplitude()
+        self._proprioception_noise = noise.proprioception()
         self._elevation_noise = noise.elevation
 
     @property

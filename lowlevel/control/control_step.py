@@ -12,13 +12,15 @@ from torch import Tensor, nn
 
 from lowlevel.commands import CommandSpace
 from lowlevel.control.observation import (
+    FRAME,
     FRAME_SIZE,
     HISTORY_LENGTH,
-    FrameBuilder,
+    FrameView,
     Proprioception,
+    build,
+    columns,
     map_observation,
     push_history,
-    split_frame,
     start_history,
 )
 from lowlevel.control.reference import Reference, ReferenceState
@@ -58,7 +60,6 @@ class ControlStep(nn.Module):
         self.action_limit = action_limit
         self._space = space
         self._action_scale = action_scale
-        self._build_frame = FrameBuilder(space, reference, action_scale.device)
 
     @property
     def experts(self) -> int:
@@ -82,17 +83,9 @@ class ControlStep(nn.Module):
         """One control period, with ``elevation_map`` (N, 121) [m], ``command`` (N, 21) and ``flag`` (N, 1)."""
         command = self.reference.clamp(command)
         state = self.reference.advance(ReferenceState(memory["reference"], memory["phase"]), command)
-        frame = self._build_frame(
-            measured.joint_position,
-            measured.joint_velocity,
-            measured.base_angular_velocity,
-            measured.projected_gravity,
-            command,
-            memory["action"],
-            state,
-        )
+        frame = build(FRAME, FrameView(measured, command, memory["action"], state, self._space))
         # Gravity is a unit vector in every frame that was ever measured.
-        last_gravity = split_frame(memory["history"][:, -1])["projected_gravity"]
+        last_gravity = memory["history"][:, -1, columns(FRAME, "projected_gravity")]
         is_first = (last_gravity == 0.0).all(dim=1)[:, None, None]
         history = torch.where(is_first, start_history(frame), push_history(memory["history"], frame))
         output = self.actor(history.flatten(1), map_observation(elevation_map), flag)

@@ -31,7 +31,7 @@ from lowlevel.control.observation import (
     HISTORY_LENGTH,
     Proprioception,
     columns,
-    normalised_columns,
+    normalized_columns,
 )
 from lowlevel.control.onnx_step import OnnxStep, export_step
 from lowlevel.control.reference import Reference, ReferenceConfig
@@ -281,7 +281,7 @@ def _read_policy(folder: Path, config: ControllerConfig, device: torch.device | 
     except (KeyError, TypeError, ValueError) as error:
         raise ControllerError(f"{path} is incomplete: {error}") from error
     tensors = _FOLDER.read_weights(folder)
-    actor = PilotActor(actor_sizes(), policy.network, ~normalised_columns(FRAME))
+    actor = PilotActor(actor_sizes(), policy.network, ~normalized_columns(FRAME))
     try:
         pose_tensors = [tensors.pop(f"nominal_pose.{name}").to(device) for name in _POSE_TENSORS]
     except KeyError as error:

@@ -1,4 +1,4 @@
-"""Observation layout: what the policy and the critic see, stated once as tables of named blocks.
+"""What the policy sees, stated once as a table of named blocks, each with its mirror and what it is read from.
 
 The policy's frame is the paper's o_t^n = [q, q_dot, omega, g, c, a_{t-1}] plus two additions: the slewed velocity and
 posture, and the gait clock, without which the joint targets under the residual would be hidden from the policy.
@@ -6,17 +6,16 @@ posture, and the gait clock, without which the joint targets under the residual 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import takewhile
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from lowlevel import commands
-from lowlevel.commands import COMMAND_SIZE, CommandSpace
-from lowlevel.control.elevation_map import MAP_MIRROR, MAP_SIZE
-from lowlevel.control.reference import Reference, ReferenceState
+from lowlevel.commands import CommandSpace
+from lowlevel.control.reference import ReferenceState
 from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS
 from robots.g1.mirror import AXIAL_VECTOR, JOINTS_MIRROR, VECTOR, Mirror, concatenate, signs
 
@@ -29,78 +28,10 @@ HISTORY_LENGTH = 5
 NOMINAL_MAP_DISTANCE = 0.75
 """Vertical distance base - terrain [m] that the policy sees as zero."""
 
-_PAIR_VECTOR = Mirror(concatenate(VECTOR, VECTOR).index[[3, 4, 5, 0, 1, 2]], concatenate(VECTOR, VECTOR).sign)
-_PAIR = Mirror(signs(1, 1).index[::-1].copy(), signs(1, 1).sign)
-_SLEWED = slice(0, commands.ARMS.start)
-"""Velocity and posture: what of the slewed command the policy sees beside the command."""
-_SLEWED_MIRROR = Mirror(commands.MIRROR.index[_SLEWED], commands.MIRROR.sign[_SLEWED])
-
-
-@dataclass(frozen=True)
-class Block:
-    """A named part of an observation vector: its mirror, and whether running statistics normalise it."""
-
-    name: str
-    mirror: Mirror
-    normalised: bool = True
-
-    @property
-    def size(self) -> int:
-        return len(self.mirror.index)
-
-
-FRAME: tuple[Block, ...] = (
-    Block("joint_position", JOINTS_MIRROR),
-    Block("joint_velocity", JOINTS_MIRROR),
-    Block("base_angular_velocity", AXIAL_VECTOR),
-    Block("projected_gravity", VECTOR),
-    Block("command", commands.MIRROR, normalised=False),
-    Block("last_action", JOINTS_MIRROR),
-    Block("slewed_command", _SLEWED_MIRROR, normalised=False),
-    # Half a gait period later left and right have changed places, so both components change sign.
-    Block("gait_clock", signs(-1, -1), normalised=False),
-)
-"""The policy's proprioceptive frame, in order."""
-FRAME_SIZE = sum(block.size for block in FRAME)
-FRAME_MIRROR = concatenate(*(block.mirror for block in FRAME))
-
-PRIVILEGED: tuple[Block, ...] = (
-    Block("base_linear_velocity", VECTOR),
-    *FRAME,
-    Block("base_height_error", signs(1)),
-    Block("torso_error", AXIAL_VECTOR),
-    Block("mean_velocity_error", signs(1, -1, -1)),
-    Block("foot_contact", _PAIR, normalised=False),
-    Block("foot_clearance", _PAIR),
-    Block("foot_position", _PAIR_VECTOR),
-    Block("foot_velocity", _PAIR_VECTOR),
-    Block("foot_force", _PAIR_VECTOR),
-    Block("hand_force", _PAIR_VECTOR),
-    Block("friction", signs(1)),
-    Block("added_mass", signs(1, 1)),
-    Block("flag", signs(1), normalised=False),
-    Block("elevation_map", MAP_MIRROR, normalised=False),
-)
-"""What the critic sees, noise-free; the true base velocity (heading frame) comes first."""
-PRIVILEGED_SIZE = sum(block.size for block in PRIVILEGED)
-PRIVILEGED_MIRROR = concatenate(*(block.mirror for block in PRIVILEGED))
-
-MIRRORS: dict[str, Mirror] = {
-    "history": FRAME_MIRROR.repeated(HISTORY_LENGTH + 1),
-    "elevation_map": MAP_MIRROR,
-    "privileged": PRIVILEGED_MIRROR,
-    "action": JOINTS_MIRROR,
-}
-
-
-def normalised_columns(blocks: tuple[Block, ...]) -> Tensor:
-    """Mask (D,) of the columns that running statistics normalise."""
-    return torch.cat([torch.full((block.size,), block.normalised) for block in blocks])
-
 
 @dataclass(frozen=True)
 class Proprioception:
-    """What the controller measures on N robots."""
+    """What the sensors of N robots measure."""
 
     joint_position: Tensor
     """(N, 29) [rad], Unitree's order."""
@@ -137,47 +68,85 @@ class NoiseConfig:
     elevation: float = 0.02
     """[m]"""
 
-    def frame_amplitude(self) -> Tensor:
-        """Half-width of the noise on what is measured, the first M columns of a frame (M,)."""
-        measured = takewhile(lambda block: hasattr(self, block.name), FRAME)
-        return torch.cat([torch.full((block.size,), getattr(self, block.name)) for block in measured])
+    def proprioception(self) -> Tensor:
+        """Half-width of the noise on each number of a :class:`Proprioception` (64,), in the order of its fields."""
+        joints = [self.joint_position] * NUM_JOINTS + [self.joint_velocity] * NUM_JOINTS
+        return torch.tensor([*joints, *[self.base_angular_velocity] * 3, *[self.projected_gravity] * 3])
 
 
-class FrameBuilder:
-    """Assembles proprioceptive frames; shared by the environment and the frozen controller."""
-
-    def __init__(self, space: CommandSpace, reference: Reference, device: torch.device | str = "cpu") -> None:
-        self._reference = reference
-        lower, upper = space.bounds(device)
-        self._middle, self._half_range = 0.5 * (upper + lower), 0.5 * (upper - lower)
-        self._default = torch.tensor(DEFAULT_POSITION, dtype=torch.float32, device=device)
-
-    def __call__(
-        self,
-        joint_position: Tensor,
-        joint_velocity: Tensor,
-        base_angular_velocity: Tensor,
-        projected_gravity: Tensor,
-        command: Tensor,
-        last_action: Tensor,
-        reference: ReferenceState,
-    ) -> Tensor:
-        """Frame (N, FRAME_SIZE) from measurements, the clamped command (N, 21) and the reference."""
-        slewed = (reference.command - self._middle) / self._half_range
-        parts = (
-            joint_position - self._default,
-            joint_velocity,
-            base_angular_velocity,
-            projected_gravity,
-            (command - self._middle) / self._half_range,
-            last_action,
-            slewed[:, _SLEWED],
-            self._reference.clock(reference),
-        )
-        return torch.cat(parts, dim=-1)
+View = TypeVar("View", contravariant=True)
 
 
-def columns(blocks: Sequence[Block], name: str) -> slice:
+@dataclass(frozen=True)
+class Block(Generic[View]):
+    """A named part of an observation vector."""
+
+    name: str
+    mirror: Mirror
+    read: Callable[[View], Tensor]
+    """The block (N, size) of what is seen."""
+    normalized: bool = True
+    """Whether running statistics normalize it."""
+
+    @property
+    def size(self) -> int:
+        return len(self.mirror.index)
+
+
+@dataclass(frozen=True)
+class FrameView:
+    """What a frame of N robots is read from."""
+
+    proprioception: Proprioception
+    command: Tensor
+    """Clamped command (N, 21)."""
+    last_action: Tensor
+    """(N, 29), in action scales."""
+    reference: ReferenceState
+    space: CommandSpace
+
+
+_SLEWED = slice(0, commands.ARMS.start)
+"""Velocity and posture: what of the slewed command the policy sees beside the command."""
+_SLEWED_MIRROR = Mirror(commands.MIRROR.index[_SLEWED], commands.MIRROR.sign[_SLEWED])
+
+
+def _from_default(joint_position: Tensor) -> Tensor:
+    return joint_position - torch.tensor(DEFAULT_POSITION, dtype=torch.float32, device=joint_position.device)
+
+
+FRAME: tuple[Block[FrameView], ...] = (
+    Block("joint_position", JOINTS_MIRROR, lambda v: _from_default(v.proprioception.joint_position)),
+    Block("joint_velocity", JOINTS_MIRROR, lambda v: v.proprioception.joint_velocity),
+    Block("base_angular_velocity", AXIAL_VECTOR, lambda v: v.proprioception.base_angular_velocity),
+    Block("projected_gravity", VECTOR, lambda v: v.proprioception.projected_gravity),
+    Block("command", commands.MIRROR, lambda v: v.space.scaled(v.command), normalized=False),
+    Block("last_action", JOINTS_MIRROR, lambda v: v.last_action),
+    Block(
+        "slewed_command",
+        _SLEWED_MIRROR,
+        lambda v: v.space.scaled(v.reference.command)[:, _SLEWED],
+        normalized=False,
+    ),
+    # Half a gait period later left and right have changed places, so both components change sign.
+    Block("gait_clock", signs(-1, -1), lambda v: v.reference.clock, normalized=False),
+)
+"""The policy's proprioceptive frame, in order."""
+FRAME_SIZE = sum(block.size for block in FRAME)
+FRAME_MIRROR = concatenate(*(block.mirror for block in FRAME))
+
+
+def build(blocks: Sequence[Block[View]], view: View) -> Tensor:
+    """The observation vector (N, D) that ``blocks`` read from ``view``."""
+    return torch.cat([block.read(view) for block in blocks], dim=-1)
+
+
+def normalized_columns(blocks: Sequence[Block[View]]) -> Tensor:
+    """Mask (D,) of the columns that running statistics normalize."""
+    return torch.cat([torch.full((block.size,), block.normalized) for block in blocks])
+
+
+def columns(blocks: Sequence[Block[View]], name: str) -> slice:
     """Where the block called ``name`` stands among ``blocks``."""
     start = 0
     for block in blocks:
@@ -185,12 +154,6 @@ def columns(blocks: Sequence[Block], name: str) -> slice:
             return slice(start, start + block.size)
         start += block.size
     raise LookupError(f"there is no block {name!r}")
-
-
-def split_frame(frame: Tensor) -> dict[str, Tensor]:
-    """The blocks of a frame (N, FRAME_SIZE) by name."""
-    parts = frame.split([block.size for block in FRAME], dim=-1)
-    return {block.name: part for block, part in zip(FRAME, parts, strict=True)}
 
 
 def start_history(frame: Tensor) -> Tensor:
@@ -206,7 +169,3 @@ def push_history(history: Tensor, frame: Tensor) -> Tensor:
 def map_observation(elevation: Tensor) -> Tensor:
     """Elevation map as observed (N, 121), from vertical distances base - terrain [m]."""
     return (elevation - NOMINAL_MAP_DISTANCE).clamp(-1.0, 1.0)
-
-
-assert FRAME_SIZE == 3 * NUM_JOINTS + 6 + COMMAND_SIZE + 9
-assert MAP_MIRROR.index.size == MAP_SIZE

@@ -70,6 +70,11 @@ class ReferenceState(NamedTuple):
         """Whether the gait clock runs (N,)."""
         return self.phase > 0.0
 
+    @property
+    def clock(self) -> Tensor:
+        """Gait clock as the policy sees it (N, 2): sine and cosine of the phase, zero while standing."""
+        return torch.stack([torch.sin(self.phase), torch.cos(self.phase)], -1) * self.walking[:, None]
+
 
 class Reference:
     """Advances reference states and turns them into joint targets; holds no per-robot state itself."""
@@ -132,10 +137,6 @@ class Reference:
         stopping = phase + 2.0 * math.pi * turns + self._phase_step
         end = torch.where(stopping < 4.5 * math.pi, 4.0 * math.pi, 7.0 * math.pi)
         return torch.where((phase > 0.0) & (stopping < end), stopping, 0.0)
-
-    def clock(self, state: ReferenceState) -> Tensor:
-        """Gait clock as the policy sees it (N, 2): sine and cosine of the phase, zero while standing."""
-        return torch.stack([torch.sin(state.phase), torch.cos(state.phase)], -1) * state.walking[:, None]
 
     def joint_targets(self, state: ReferenceState) -> Tensor:
         """PD targets (N, 29) [rad] that hold the slewed posture, led by what gravity would make the joints sag.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -45,6 +46,12 @@ class Measurement:
     """Pelvis above the ground under the lowest foot (N,) [m]."""
     torso_orientation: Tensor
     """Torso quaternion relative to the heading frame (N, 4)."""
+    foot_position: Tensor
+    """Centre of each sole from the pelvis (N, 2, 3) [m]."""
+    foot_velocity: Tensor
+    """(N, 2, 3) [m/s]."""
+    foot_force: Tensor
+    """Net contact force on each foot (N, 2, 3) [N]."""
     foot_clearance: Tensor
     """Sole above the ground below it (N, 2) [m]."""
     foot_contact: Tensor
@@ -68,6 +75,9 @@ def measure(robot: RobotState, terrain: Terrain) -> Measurement:
     down[:, 2] = -1.0
     ground = terrain.height(robot.foot_position[..., :2])
     lowest = robot.foot_position[..., 2].argmin(dim=1, keepdim=True)
+    from_pelvis = robot.foot_position - robot.base_position[:, None]
+    feet = torch.cat([from_pelvis, robot.foot_velocity, robot.foot_force], dim=1)
+    position, velocity, force = rotate_about_vertical(-heading[:, None], feet).split(2, dim=1)
     return Measurement(
         robot=robot,
         heading=heading,
@@ -76,10 +86,25 @@ def measure(robot: RobotState, terrain: Terrain) -> Measurement:
         projected_gravity=rotate(conjugate(robot.base_quaternion), down),
         base_height=robot.base_position[:, 2] - ground.gather(1, lowest)[:, 0],
         torso_orientation=multiply(about_axis(2, -heading), robot.torso_quaternion),
+        foot_position=position,
+        foot_velocity=velocity,
+        foot_force=force,
         foot_clearance=robot.foot_position[..., 2] - ground,
         foot_contact=robot.foot_force.norm(dim=-1) > LOADED_FOOT_FORCE,
         body_clearance=robot.body_points[..., 2] - terrain.height(robot.body_points[..., :2]),
     )
+
+
+Rows = TypeVar("Rows", Measurement, RobotState)
+
+
+def with_rows(whole: Rows, ids: Tensor, part: Rows) -> Rows:
+    """A copy of ``whole`` in which rows ``ids`` (n,) are the n rows of ``part``."""
+    changed: dict[str, Any] = {}
+    for field in fields(whole):
+        old, new = getattr(whole, field.name), getattr(part, field.name)
+        changed[field.name] = old.index_copy(0, ids, new) if isinstance(old, Tensor) else with_rows(old, ids, new)
+    return replace(whole, **changed)
 
 
 def velocity_error(measured: Measurement, command: Tensor) -> Tensor:
@@ -110,7 +135,7 @@ def arm_error(measured: Measurement, command: Tensor) -> Tensor:
 
 def stumbles(measured: Measurement) -> Tensor:
     """Whether a loaded foot is pushed sideways at least as hard as upwards (N,) (paper, IV-A-2)."""
-    force = measured.robot.foot_force
+    force = measured.foot_force
     sideways = force[..., :2].norm(dim=-1) >= force[..., 2].abs()
     return (sideways & measured.foot_contact).any(dim=-1)
 

@@ -38,8 +38,8 @@ def standing() -> Transition:
 
 def moved(transition: Transition, **changes: torch.Tensor) -> Transition:
     """The transition with some measured quantities replaced."""
-    robot = {name: value for name, value in changes.items() if hasattr(transition.measured.robot, name)}
-    derived = {name: value for name, value in changes.items() if name not in robot}
+    derived = {name: value for name, value in changes.items() if hasattr(transition.measured, name)}
+    robot = {name: value for name, value in changes.items() if name not in derived}
     measured: Measurement = replace(transition.measured, robot=replace(transition.measured.robot, **robot), **derived)
     return replace(transition, measured=measured)
 
@@ -111,7 +111,7 @@ def test_feet_are_to_be_where_the_told_velocity_needs_them(standing: Transition)
     landing = replace(standing, command=command, phase=torch.full((4,), torch.pi), walking=walking)
     right = torch.tensor([[1.0, 1.0, 0.0]]).repeat(4, 1)
     left = right + torch.tensor([[0.2, 0.18, 0.0], [0.1, 0.18, 0.0], [0.2, 0.28, 0.0], [-0.2, 0.18, 0.0]])
-    placed = moved(landing, foot_position=torch.stack([left, right], dim=1), heading=torch.zeros(4))
+    placed = moved(landing, foot_position=torch.stack([left, right], dim=1))
     squares = [0.0, 0.01, 0.01, 0.16]
     assert term("foot_placement", placed) == pytest.approx([2.718281828 ** (-s / 0.02) for s in squares], rel=1e-4)
 

@@ -38,6 +38,24 @@ def test_a_robot_stands_as_it_is_told_on_the_highest_ground_under_its_feet() -> 
     assert not world.fallen(measured).any()
 
 
+def test_what_is_measured_in_the_heading_frame_does_not_depend_on_the_heading() -> None:
+    world = World(ModelOptions(), TerrainConfig(), num_robots=3, num_threads=1)
+    limits = world.simulation.joint_lower, world.simulation.joint_upper
+    neutral = command_space(*(limit.tolist() for limit in limits)).neutral().repeat(3, 1)
+    heading = torch.tensor([0.0, 1.5, -2.5])
+    forwards = torch.zeros(3, 6)
+    forwards[:, 0], forwards[:, 1] = 0.5 * torch.cos(heading), 0.5 * torch.sin(heading)
+    everyone = torch.arange(3)
+    world.simulation.restart(everyone)
+    joints = world.stand(everyone, torch.zeros(3, 2), heading, neutral, velocity=forwards)
+    for _ in range(5):
+        measured = world.advance(joints)
+    assert measured.foot_contact.any(dim=1).all() and (measured.linear_velocity[:, 0] > 0.3).all()
+    for name in ("linear_velocity", "foot_position", "foot_velocity", "foot_force"):
+        values = getattr(measured, name)
+        torch.testing.assert_close(values[1:], values[:1].expand_as(values[1:]), atol=1e-2, rtol=1e-2)
+
+
 def test_what_no_world_can_be_made_of_is_refused() -> None:
     with pytest.raises(PilotError, match="does not divide"):
         World(ModelOptions(timestep=0.003), TerrainConfig(), num_robots=1, num_threads=1)
