@@ -291,7 +291,7 @@ def report_text(evaluation: Evaluation) -> str:
     """``report.md``."""
     figures = evaluation.figures
     survival, speed = figures["walk_half_mps_survival"], figures["walk_half_mps_speed"]
-    energy, action_rate = figures["energy_per_metre"], figures["action_rate"]
+    energy, action_rate = figures["energy_per_meter"], figures["action_rate"]
     episodes = figures["fall_rate"].n
     return "\n".join(
         [
@@ -311,7 +311,7 @@ def report_text(evaluation: Evaluation) -> str:
             ),
             "![tracking](tracking.png)",
             "",
-            f"Travelling costs {format_figure(energy, 0)} J per metre: the sum of |torque times joint speed| over all "
+            f"Traveling costs {format_figure(energy, 0)} J per meter: the sum of |torque times joint speed| over all "
             "steps whose command asks for translation, by the way made good in the commanded direction. From one "
             f"control step to the next a joint's target moves by {format_figure(action_rate, 4)} rad on average.",
             "",

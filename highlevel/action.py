@@ -82,9 +82,9 @@ class ActionMap:
 
     def action(self, command: Tensor) -> Tensor:
         """The action (N, 21), within [-1, 1], whose command is nearest to ``command`` (N, 21)."""
-        return self.normalise(command).clamp(-1.0, 1.0)
+        return self.normalize(command).clamp(-1.0, 1.0)
 
-    def normalise(self, command: Tensor) -> Tensor:
+    def normalize(self, command: Tensor) -> Tensor:
         """``command`` (N, 21) in units of the action; not clipped."""
         return 2.0 * (command - self.lower) / (self.upper - self.lower) - 1.0
 

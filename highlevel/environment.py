@@ -260,7 +260,7 @@ class CommandEnvironment:
                 measured.projected_gravity,
                 robot.joint_position - self._default,
                 robot.joint_velocity,
-                self.action_map.normalise(self.command),
+                self.action_map.normalize(self.command),
                 self.task.observe_additions(measured, time_left),
             ],
             dim=-1,

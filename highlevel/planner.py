@@ -1,7 +1,7 @@
 """The trained planner as a folder: observation in, action out, for any number of robots.
 
 ``planner.json``         task, controller, observation layout, action ranges, network, and where it comes from
-``weights.safetensors``  normaliser and actor
+``weights.safetensors``  normalizer and actor
 
 Nothing in it is pickled.
 """
@@ -45,7 +45,7 @@ _FOLDER = FrozenFolder(
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """Contents of ``planner.json`` that define behaviour."""
+    """Contents of ``planner.json`` that define behavior."""
 
     task: str
     """Name of the task."""

@@ -117,7 +117,7 @@ class PilotEnvironment:
 
     Args:
         config: the task.
-        seed: seed of commands, noise, randomisation and resets.
+        seed: seed of commands, noise, randomization and resets.
         device: where tensors live.
     """
 

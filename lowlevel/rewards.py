@@ -26,7 +26,7 @@ class RewardWeights:
     torso_orientation: float = 1.0
     upper_body_position: float = 1.0
     termination: float = -200.0
-    # Table I, regularisation
+    # Table I, regularization
     action_rate: float = -0.01
     energy: float = -0.001
     joint_deviation: float = -0.5
@@ -95,7 +95,7 @@ def angular_velocity(t: Transition) -> Tensor:
 
 
 def base_height(t: Transition) -> Tensor:
-    """Laplace kernel on the base height error, scale 5 cm: it keeps its slope down to the last millimetre."""
+    """Laplace kernel on the base height error, scale 5 cm: it keeps its slope down to the last millimeter."""
     return torch.exp(-height_error(t.measured, t.command).abs() / 0.05)
 
 

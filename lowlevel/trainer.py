@@ -45,7 +45,7 @@ class TrainingConfig:
     total_steps: int = 250_000_000
     """Environment steps (robots times control steps), over all ranks."""
     seed: int = 0
-    """Seed of weights, noise, commands and randomisation."""
+    """Seed of weights, noise, commands and randomization."""
     device: str = "cpu"
     """Where the learner runs; physics always runs on the CPU."""
     save_interval: float = 300.0

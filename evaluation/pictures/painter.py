@@ -109,7 +109,7 @@ class Painter:
         self._context.free()
 
     def draw(self, data: mujoco.MjData, camera: mujoco.MjvCamera) -> np.ndarray:
-        """The scene as ``camera`` sees it (height, width, 3), 8 bits per colour."""
+        """The scene as ``camera`` sees it (height, width, 3), 8 bits per color."""
         self._context.make_current()
         every = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self.model, data, self._options, None, camera, every, self._scene)

@@ -35,7 +35,7 @@ class VisualTwin:
         self.data = mujoco.MjData(self.model)
 
     def adopt_sizes(self, simulation: BatchSimulation, row: int) -> None:
-        """Take over the sizes of simulation ``row``'s named geoms, such as a randomised box."""
+        """Take over the sizes of simulation ``row``'s named geoms, such as a randomized box."""
         source = simulation.robot_model(row)
         for geom in range(source.ngeom):
             name = source.geom(geom).name

@@ -29,7 +29,7 @@ from robots.g1.model import ModelOptions
 BATCH = 32
 """Robots side by side. The last digits of a matrix product, and with them a fall, depend on its row count."""
 START_SPREAD = 1.0
-"""Largest distance of a start from its tile's centre, per axis [m]."""
+"""Largest distance of a start from its tile's center, per axis [m]."""
 JOINT_SPREAD = 0.02
 """Largest deviation of a joint from the standing pose at the start [rad]."""
 _PROPRIOCEPTION_SIZE = 2 * NUM_JOINTS + 6

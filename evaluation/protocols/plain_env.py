@@ -14,7 +14,7 @@ from robots.g1.model import ModelOptions, build_spec
 
 
 class PlainMujocoEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Joint targets around the default pose in, positions and velocities out; no reward, no randomisation.
+    """Joint targets around the default pose in, positions and velocities out; no reward, no randomization.
 
     Args:
         gains: gain set of the actuators.

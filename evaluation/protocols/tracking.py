@@ -263,7 +263,7 @@ def tracking_figures(table: CommandTable, tile_names: Sequence[str]) -> dict[str
         figures[f"fall_rate{suffix}"] = share_figure(part.by_episode("fell").astype(bool))
         figures[f"fall_rate_command{suffix}"] = mean_figure(part.by_episode("fell"), "1")
     figures["non_finite_rate"] = share_figure(table.by_episode("failed").astype(bool))
-    figures["energy_per_metre"] = energy_per_metre(table.by_episode("energy"), table.by_episode("progress"))
+    figures["energy_per_meter"] = energy_per_meter(table.by_episode("energy"), table.by_episode("progress"))
     figures["action_rate"] = mean_figure(table.by_episode("action_rate"), "rad")
     return figures
 
@@ -284,14 +284,14 @@ def paired_differences(ours: CommandTable, other: CommandTable) -> dict[str, Fig
     return {name: mean_figure(ours.by_episode(name) - other.by_episode(name), units[name]) for name in COMPARED}
 
 
-def energy_per_metre(energy: np.ndarray, progress: np.ndarray) -> Figure:
+def energy_per_meter(energy: np.ndarray, progress: np.ndarray) -> Figure:
     """All work over all way made good [J/m], from episodes' ``energy`` [J] and ``progress`` [m]; both (episodes,).
 
     Single episodes give no usable ratio: one that only staggers on the spot has made no way. The ratio of the sums is
-    the mean of its own linearisation, one number per episode, which gives the interval.
+    the mean of its own linearization, one number per episode, which gives the interval.
     """
-    travelled = energy > 0.0
-    energy, progress = energy[travelled], progress[travelled]
+    traveled = energy > 0.0
+    energy, progress = energy[traveled], progress[traveled]
     if progress.sum() <= 0.0:
         return Figure(None, "J/m", None, 0)
     ratio = energy.sum() / progress.sum()

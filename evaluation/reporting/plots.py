@@ -67,7 +67,7 @@ def plot_curves(
 def plot_overlays(
     path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], label: str, columns: int = 4
 ) -> None:
-    """One panel per title, in it one named curve (x (T,), y (T,)) per case; cases keep their colours."""
+    """One panel per title, in it one named curve (x (T,), y (T,)) per case; cases keep their colors."""
     rows = -(-len(panels) // columns)
     canvas, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 2.6 * rows), squeeze=False)
     for axis in axes.flat[len(panels) :]:

@@ -1,4 +1,4 @@
-"""Behaviour cloning of demonstrations into a Stable-Baselines3 policy, actor and critic.
+"""Behavior cloning of demonstrations into a Stable-Baselines3 policy, actor and critic.
 
 The ``imitation`` package is tied to an older Stable-Baselines3, so the loss is written out: -log pi(a|s) for
 the actor and the Huber loss of the demonstrated returns for the critic. PPO after cloning is known to
@@ -16,13 +16,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
 
 from highlevel.learning.demonstrations import Demonstrations
-from highlevel.learning.policy import Normaliser
+from highlevel.learning.policy import Normalizer
 from robots.errors import PilotError
 
 
 @dataclass(frozen=True)
 class CloningConfig:
-    """Behaviour cloning."""
+    """Behavior cloning."""
 
     epochs: int = 60
     """Passes over the demonstrations."""
@@ -33,7 +33,7 @@ class CloningConfig:
     held_out: float = 0.1
     """Share of the episodes that is only used to measure the error."""
     observation_noise: float = 0.02
-    """Noise on normalised observations, against reading too much into them."""
+    """Noise on normalized observations, against reading too much into them."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ def clone(
     seed: int,
     on_progress: Callable[[int, float], None] | None = None,
 ) -> CloningResult:
-    """Fit ``policy`` to the demonstrations; its normaliser takes their statistics, its exploration stays.
+    """Fit ``policy`` to the demonstrations; its normalizer takes their statistics, its exploration stays.
 
     Args:
         policy: to be changed.
         demonstrations: what to imitate.
-        scale: the task's observation scale (D,); the normaliser's scales stay above a tenth of it.
+        scale: the task's observation scale (D,); the normalizer's scales stay above a tenth of it.
         config: how.
         seed: of shuffling and noise.
         on_progress: told epoch and training error.
@@ -71,16 +71,16 @@ def clone(
     """
     if demonstrations.count == 0:
         raise PilotError("there are no demonstrations to clone: record some first")
-    normaliser = policy.features_extractor
-    assert isinstance(normaliser, Normaliser)
-    if demonstrations.observation.shape[1] != normaliser.features_dim:
+    normalizer = policy.features_extractor
+    assert isinstance(normalizer, Normalizer)
+    if demonstrations.observation.shape[1] != normalizer.features_dim:
         raise PilotError(
             f"the demonstrations have {demonstrations.observation.shape[1]} observations, this task has "
-            f"{normaliser.features_dim}: record them again"
+            f"{normalizer.features_dim}: record them again"
         )
     observation = torch.from_numpy(demonstrations.observation)
     action, value = torch.from_numpy(demonstrations.action), torch.from_numpy(demonstrations.value)
-    normaliser.fit(observation, 0.1 * scale)
+    normalizer.fit(observation, 0.1 * scale)
     numbers = np.unique(demonstrations.episode)
     held_out = numbers[: int(config.held_out * len(numbers))]
     is_held_out = torch.from_numpy(np.isin(demonstrations.episode, held_out))
@@ -97,7 +97,7 @@ def clone(
         squares, value_squares = 0.0, 0.0
         for batch in train[torch.randperm(len(train), generator=generator)].split(config.batch_size):
             seen = observation[batch]
-            noise = torch.randn(seen.shape, generator=generator) * config.observation_noise * normaliser.scale
+            noise = torch.randn(seen.shape, generator=generator) * config.observation_noise * normalizer.scale
             values, log_probability, _ = policy.evaluate_actions(seen + noise, action[batch])
             distance = values[:, 0] - value[batch]
             loss = -log_probability.mean() + 0.5 * torch.nn.functional.huber_loss(values[:, 0], value[batch])

@@ -23,7 +23,7 @@ class PPOConfig:
     discount: float = 0.98
     """Per decision."""
     gae_lambda: float = 0.95
-    """Of the generalised advantage estimate."""
+    """Of the generalized advantage estimate."""
     learning_rate: float = 1e-4
     """Without demonstrations."""
     learning_rate_after_cloning: float = 1e-5

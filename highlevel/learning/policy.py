@@ -11,12 +11,12 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from torch import Tensor, nn
 
 CLIP = 8.0
-"""Normalised observations are clipped to +- this."""
+"""Normalized observations are clipped to +- this."""
 
 
 @dataclass(frozen=True)
 class PlannerNetwork:
-    """Shape of actor and critic, which share nothing but the normaliser."""
+    """Shape of actor and critic, which share nothing but the normalizer."""
 
     hidden: tuple[int, ...] = (256, 256, 128)
     """Widths of the hidden layers, with ELU between them."""
@@ -24,8 +24,8 @@ class PlannerNetwork:
     """Logarithm of the initial standard deviation of the action."""
 
 
-class Normaliser(BaseFeaturesExtractor):
-    """Fixed normalisation of the observation. It is part of the weights, so it cannot be lost."""
+class Normalizer(BaseFeaturesExtractor):
+    """Fixed normalization of the observation. It is part of the weights, so it cannot be lost."""
 
     def __init__(self, observation_space: gymnasium.Space, scale: Tensor | None = None) -> None:
         assert observation_space.shape is not None
@@ -59,20 +59,20 @@ class PlannerActor(nn.Module):
         self.output = nn.Linear(hidden[-1], action_size)
 
     def forward(self, observation: Tensor) -> Tensor:
-        normalised = ((observation - self.mean) / self.scale).clamp(-CLIP, CLIP)
-        return self.output(self.hidden(normalised))
+        normalized = ((observation - self.mean) / self.scale).clamp(-CLIP, CLIP)
+        return self.output(self.hidden(normalized))
 
     @classmethod
     def from_policy(cls, policy: ActorCriticPolicy, hidden: tuple[int, ...]) -> PlannerActor:
         """A copy of the actor of a policy that was built with :func:`policy_arguments`."""
-        normaliser = policy.features_extractor
-        assert isinstance(normaliser, Normaliser)
+        normalizer = policy.features_extractor
+        assert isinstance(normalizer, Normalizer)
         action_size = policy.action_net.state_dict()["bias"].numel()
-        actor = cls(normaliser.features_dim, action_size, hidden)
+        actor = cls(normalizer.features_dim, action_size, hidden)
         actor.hidden.load_state_dict(policy.mlp_extractor.policy_net.state_dict())
         actor.output.load_state_dict(policy.action_net.state_dict())
-        actor.mean.copy_(normaliser.mean)
-        actor.scale.copy_(normaliser.scale)
+        actor.mean.copy_(normalizer.mean)
+        actor.scale.copy_(normalizer.scale)
         return actor.eval().requires_grad_(False)
 
 
@@ -84,7 +84,7 @@ def policy_arguments(network: PlannerNetwork, scale: Tensor) -> dict[str, object
         "activation_fn": nn.ELU,
         "ortho_init": False,
         "log_std_init": network.log_std,
-        "features_extractor_class": Normaliser,
+        "features_extractor_class": Normalizer,
         "features_extractor_kwargs": {"scale": scale},
     }
 

@@ -65,7 +65,7 @@ class PlannerPPO(PPO):
         self.finished_updates += 1
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights, optimiser, counters and torch's random numbers; not the environment.
+        """Weights, optimizer, counters and torch's random numbers; not the environment.
 
         The order of minibatches is drawn by NumPy, which begins anew in a resumed run.
 

@@ -4,7 +4,7 @@ A controller is a folder. Nothing in it is pickled:
 
 ``controller.json``      every convention at full precision, and where the controller comes from
 ``controller.onnx``      the whole control step as :mod:`lowlevel.control.onnx_step` describes it; needs ONNX Runtime
-``weights.safetensors``  policy weights, normaliser and nominal-pose table, for torch
+``weights.safetensors``  policy weights, normalizer and nominal-pose table, for torch
 ``golden.json``          reference inputs and outputs that any port can be checked against
 """
 

@@ -46,7 +46,7 @@ class ReferenceConfig:
     height_rate: float = 0.6
     """Slew rate of the base height [m/s]."""
     torso_rate: tuple[float, float, float] = (1.2, 1.2, 2.0)
-    """Slew rates of the torso's roll, pitch and yaw [rad/s]; yaw hardly moves the centre of mass."""
+    """Slew rates of the torso's roll, pitch and yaw [rad/s]; yaw hardly moves the center of mass."""
     arm_rate: float = 5.0
     """Slew rate of the arm joints [rad/s]."""
 

@@ -38,7 +38,7 @@ class EstimationTerms(NamedTuple):
     """The loss and what it is made of; all scalars, on the device of the inputs."""
 
     loss: Tensor
-    """Weighted sum to minimise."""
+    """Weighted sum to minimize."""
     velocity_mse: Tensor
     """Mean squared velocity error over samples and components [m^2/s^2]."""
     contrastive: Tensor

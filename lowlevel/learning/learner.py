@@ -1,4 +1,4 @@
-"""The networks with their optimisers: the losses of one minibatch, and one gradient step on them.
+"""The networks with their optimizers: the losses of one minibatch, and one gradient step on them.
 
 Three parameter groups learn side by side with their own Adam: the actor (learning rate steered by the KL
 divergence), the critic (fixed, much higher rate) and the estimator. A policy of 29 joints and a value
@@ -50,9 +50,9 @@ class PPOConfig:
     gamma: float = 0.99
     """Discount per control step."""
     lam: float = 0.95
-    """Decay of the generalised advantage estimate."""
+    """Decay of the generalized advantage estimate."""
     advantage_limit: float = 2.0
-    """Normalised advantages are clipped to +- this: half a percent of the samples, of robots that fall, would else
+    """Normalized advantages are clipped to +- this: half a percent of the samples, of robots that fall, would else
     outweigh all others."""
     clip: float = 0.2
     """Clipping range of the probability ratio."""
@@ -111,7 +111,7 @@ def adapted_rate(rate: float, kl: float, desired_kl: float, bounds: tuple[float,
 
 
 class Learner:
-    """Actor, critic and estimator, their losses and their optimisers."""
+    """Actor, critic and estimator, their losses and their optimizers."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class Learner:
         command_columns: Tensor,
         privileged_command_columns: Tensor | None,
     ) -> None:
-        """Build networks, equal on all ranks, and optimisers; arguments as in :class:`lowlevel.learning.ppo.PPO`."""
+        """Build networks, equal on all ranks, and optimizers; arguments as in :class:`lowlevel.learning.ppo.PPO`."""
         self.config = config
         self.mirrors = mirrors
         self.device = device
@@ -205,7 +205,7 @@ class Learner:
 
     def _estimator_losses(self, samples: Mapping[str, Tensor]) -> dict[str, Tensor]:
         velocity, latent = self.actor.encode(samples["history"], samples["elevation_map"])
-        target = self.target_encoder(self.critic.normalised(samples["next_privileged"]))
+        target = self.target_encoder(self.critic.normalized(samples["next_privileged"]))
         true_velocity = samples["privileged"][:, :VELOCITY_SIZE]
         prototypes = self.target_encoder.prototypes
         terms = estimation_loss(velocity, latent, true_velocity, target, prototypes, self.config.estimation)
@@ -240,7 +240,7 @@ class Learner:
             self.optimizers[name].step()
         self.limit_noise()
         if "estimator" in groups:
-            self.target_encoder.renormalise_prototypes()
+            self.target_encoder.renormalize_prototypes()
         return {**result, "learning_rate": rate}
 
     @torch.no_grad()
@@ -250,7 +250,7 @@ class Learner:
         self.actor.log_std.clamp_(math.log(lowest), math.log(highest))
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks and optimisers."""
+        """Networks and optimizers."""
         state: dict[str, Any] = {name: module.state_dict() for name, module in self._modules.items()}
         state["optimizers"] = {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()}
         return state

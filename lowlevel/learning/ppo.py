@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (Schulman et al., arXiv 1707.06347) for the PILOT networks.
+"""Proximal policy optimization (Schulman et al., arXiv 1707.06347) for the PILOT networks.
 
 While the actor learns from a rollout it sees the estimates of that rollout, so that ratio and KL measure the
 actor's own change and not the estimator's. All statistics are taken over all ranks
@@ -50,10 +50,10 @@ class PPO:
         gait_clock: slice | None = None,
         seed: int = 0,
     ) -> None:
-        """Build networks, optimisers and storage.
+        """Build networks, optimizers and storage.
 
         ``mirrors``: one per "history", "elevation_map", "privileged" and "action". ``command_columns`` (F,)
-        bool marks the frame columns that already have a fixed scale and are not normalised, commands above all;
+        bool marks the frame columns that already have a fixed scale and are not normalized, commands above all;
         ``privileged_command_columns`` (P,) bool does the same for the critic and also hides these columns
         from the next-state encoder. ``gait_clock``: the columns of a frame with its sine and cosine, for noise that
         repeats with the gait; without it all noise is white. Ranks draw different noise from the same ``seed``.
@@ -239,7 +239,7 @@ class PPO:
 
     @torch.no_grad()
     def _store_returns(self, privileged_after: Tensor) -> float:
-        """Fill in returns and normalised advantages; returns the share of the returns' variance explained."""
+        """Fill in returns and normalized advantages; returns the share of the returns' variance explained."""
         storage = self.storage
         values = self._values(storage.flat("privileged")).view(storage.steps, storage.num_envs)
         next_values = torch.cat([values[1:], self._values(privileged_after)[None]])
@@ -270,7 +270,7 @@ class PPO:
 
     @torch.no_grad()
     def _calibrate(self) -> None:
-        """Fit the normalisers to the very first rollout before anything is learned from unscaled numbers.
+        """Fit the normalizers to the very first rollout before anything is learned from unscaled numbers.
 
         The untrained policy is almost constant, so its action means hardly change; they are computed again.
         """

@@ -15,7 +15,7 @@ def generalized_advantages(
     gamma: float,
     lam: float,
 ) -> Tensor:
-    """Generalised advantage estimates (T, N) (Schulman et al., arXiv 1506.02438).
+    """Generalized advantage estimates (T, N) (Schulman et al., arXiv 1506.02438).
 
     All arguments are (T, N). ``next_values[t]`` is the value of the state that step t led to *before* any
     reset: a truncated episode is bootstrapped with it, a terminated one is worth nothing after its end. No

@@ -55,7 +55,7 @@ class HistoryEncoder(nn.Module):
         self.layers = perceptron(inputs, config.history_hidden, outputs)
 
     def forward(self, history: Tensor, elevation_map: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised history (N, H) and map (N, M) to velocity (N, 3) [m/s] and unit latent (N, latent)."""
+        """Normalized history (N, H) and map (N, M) to velocity (N, 3) [m/s] and unit latent (N, latent)."""
         inputs = torch.cat([history, elevation_map], dim=1) if self.vision else history
         outputs = self.layers(inputs)
         return outputs[:, :VELOCITY_SIZE], functional.normalize(outputs[:, VELOCITY_SIZE:], dim=1)
@@ -138,7 +138,7 @@ class PilotActor(nn.Module):
         command_columns: Tensor,
         initial_std: float = 0.5,
     ) -> None:
-        """``command_columns`` (F,) bool: frame columns that have a fixed scale and are not normalised."""
+        """``command_columns`` (F,) bool: frame columns that have a fixed scale and are not normalized."""
         super().__init__()
         self.sizes = sizes
         self.config = config
@@ -209,10 +209,10 @@ class Critic(nn.Module):
 
     def forward(self, privileged: Tensor) -> Tensor:
         """Raw privileged observation (N, P) to values (N,)."""
-        return self.output(self.hidden(self.normalised(privileged))).squeeze(1)
+        return self.output(self.hidden(self.normalized(privileged))).squeeze(1)
 
-    def normalised(self, privileged: Tensor) -> Tensor:
-        """The columns that the critic sees, normalised (N, seen)."""
+    def normalized(self, privileged: Tensor) -> Tensor:
+        """The columns that the critic sees, normalized (N, seen)."""
         return self.normalizer(privileged[:, : self.seen])
 
 
@@ -220,7 +220,7 @@ class TargetEncoder(nn.Module):
     """Encodes the true next state for the contrastive loss and owns its prototypes; training only.
 
     Commands are hidden from it: the history contains them too, and a latent that merely copies them would
-    already tell the samples of a batch apart. So are all other columns that are not normalised: posture reference and
+    already tell the samples of a batch apart. So are all other columns that are not normalized: posture reference and
     gait clock, which the history contains as well, the flag, the elevation map, which the map encoder is for, and the
     feet's contacts, of which it still sees the forces.
     """
@@ -238,10 +238,10 @@ class TargetEncoder(nn.Module):
         self.register_buffer("visible", 1.0 - hidden.float())
 
     def forward(self, normalised_privileged: Tensor) -> Tensor:
-        """Normalised next privileged observation (N, seen) to a unit latent (N, latent)."""
+        """Normalized next privileged observation (N, seen) to a unit latent (N, latent)."""
         return functional.normalize(self.layers(normalised_privileged * self.visible), dim=1)
 
     @torch.no_grad()
-    def renormalise_prototypes(self) -> None:
+    def renormalize_prototypes(self) -> None:
         """Bring every prototype back to unit length."""
         self.prototypes.copy_(functional.normalize(self.prototypes, dim=1))

@@ -101,7 +101,7 @@ class MapEncoder(nn.Module):
         return self.output(values.flatten(1) + self.value_bias)
 
     def forward(self, elevation_map: Tensor, frame: Tensor) -> Tensor:
-        """Scaled map (N, M) and normalised frame (N, F) to the encoding (N, map_global + attention_width)."""
+        """Scaled map (N, M) and normalized frame (N, F) to the encoding (N, map_global + attention_width)."""
         attended = self.attend(self.query_layers(frame), *self.tokens(elevation_map))
         return torch.cat([functional.elu(self.global_layers(elevation_map)), attended], dim=1)
 

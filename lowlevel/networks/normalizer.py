@@ -1,4 +1,4 @@
-"""Running normalisation of observations with exact, mergeable moments."""
+"""Running normalization of observations with exact, mergeable moments."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class RunningNormalizer(nn.Module):
         self.register_load_state_dict_post_hook(lambda module, _: module.refresh())
 
     def forward(self, values: Tensor) -> Tensor:
-        """Normalise ``values`` (..., D)."""
+        """Normalize ``values`` (..., D)."""
         return torch.addcmul(self.offset, values, self.scale).clamp(-self.clip, self.clip)
 
     @torch.no_grad()

@@ -1,7 +1,7 @@
 """Data parallelism under ``torchrun``: every rank steps its own robots, all ranks share one learner.
 
 There is no wrapper around the networks. Parameters are broadcast once, gradients are averaged in one flat
-all-reduce per minibatch, and every statistic that steers learning (advantage moments, KL, normaliser moments,
+all-reduce per minibatch, and every statistic that steers learning (advantage moments, KL, normalizer moments,
 prototype assignments) is taken over all ranks, so that the ranks' parameters stay identical. Every function
 here does nothing when only one process runs.
 """

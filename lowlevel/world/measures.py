@@ -47,7 +47,7 @@ class Measurement:
     torso_orientation: Tensor
     """Torso quaternion relative to the heading frame (N, 4)."""
     foot_position: Tensor
-    """Centre of each sole from the pelvis (N, 2, 3) [m]."""
+    """Center of each sole from the pelvis (N, 2, 3) [m]."""
     foot_velocity: Tensor
     """(N, 2, 3) [m/s]."""
     foot_force: Tensor
@@ -57,7 +57,7 @@ class Measurement:
     foot_contact: Tensor
     """Loaded feet (N, 2), boolean."""
     body_clearance: Tensor
-    """Centres of the robot's body points above the ground below them (N, 7) [m]."""
+    """Centers of the robot's body points above the ground below them (N, 7) [m]."""
 
     @property
     def proprioception(self) -> Proprioception:

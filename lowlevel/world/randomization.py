@@ -1,4 +1,4 @@
-"""Domain randomisation: every randomised quantity with its range, in one place."""
+"""Domain randomization: every randomized quantity with its range, in one place."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lowlevel.world.simulation import BatchSimulation, RobotState
 from robots.g1.constants import FOOT_BODIES, NUM_JOINTS, PELVIS_BODY, TORSO_BODY
 from robots.rotations import rotate_about_vertical
 
-_RANDOMISED_BODIES = (PELVIS_BODY, TORSO_BODY)
+_RANDOMIZED_BODIES = (PELVIS_BODY, TORSO_BODY)
 _WAIST_MOTORS = ("waist_roll_joint", "waist_pitch_joint")
 MOST_DELAY = 2
 """Longest latency from sensor to motor [control steps of 20 ms]."""
@@ -27,7 +27,7 @@ class RandomizationConfig:
     added_mass: tuple[float, float] = (-1.0, 2.0)
     """Added to the pelvis and, independently, to the torso [kg]."""
     center_of_mass_shift: float = 0.02
-    """Half-width of the shift of pelvis and torso centres of mass, per axis [m]."""
+    """Half-width of the shift of pelvis and torso centers of mass, per axis [m]."""
     gain_scale: tuple[float, float] = (0.9, 1.1)
     """Factor on stiffness and damping, per joint."""
     joint_offset: float = 0.01
@@ -97,7 +97,7 @@ class Randomizer:
         self.simulation = simulation
         self.generator = generator
         model, count, device = simulation.model, simulation.num_robots, simulation.device
-        self._bodies = [model.body(name).id for name in _RANDOMISED_BODIES]
+        self._bodies = [model.body(name).id for name in _RANDOMIZED_BODIES]
         self._foot_geoms = [
             geom
             for geom in range(model.ngeom)

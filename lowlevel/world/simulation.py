@@ -1,6 +1,6 @@
 """N robots in ``mujoco.batch.Batch``: targets in, tensors of shape (N, ...) out.
 
-Above this module only randomisation (through :meth:`BatchSimulation.per_robot`) and scenes (which are ``MjSpec``) know
+Above this module only randomization (through :meth:`BatchSimulation.per_robot`) and scenes (which are ``MjSpec``) know
 MuJoCo's data structures.
 Positions and velocities of base and joints are exact; torques and what is read from sensors (torso, feet, palms,
 forces) are one physics substep old, as after any ``mj_step``.
@@ -44,7 +44,7 @@ class RobotState:
     torso_quaternion: Tensor
     """(N, 4) wxyz."""
     foot_position: Tensor
-    """Centre of each sole (N, 2, 3) [m], left then right."""
+    """Center of each sole (N, 2, 3) [m], left then right."""
     foot_velocity: Tensor
     """(N, 2, 3) [m/s]."""
     foot_force: Tensor
@@ -52,7 +52,7 @@ class RobotState:
     palm_position: Tensor
     """(N, 2, 3) [m]."""
     body_points: Tensor
-    """Centres of :data:`robots.g1.constants.BODY_POINTS` (N, 7, 3) [m]."""
+    """Centers of :data:`robots.g1.constants.BODY_POINTS` (N, 7, 3) [m]."""
     palm_quaternion: Tensor
     """(N, 2, 4) wxyz."""
 
@@ -217,7 +217,7 @@ class BatchSimulation:
         self._qvel[:, self._base_qvel][:, :3] += velocity_change.cpu().numpy()
 
     def set_hand_force(self, force: Tensor) -> None:
-        """Apply external forces (N, 2, 3) [N], world frame, at the hands' centres of mass until set again."""
+        """Apply external forces (N, 2, 3) [N], world frame, at the hands' centers of mass until set again."""
         for hand, name in enumerate(HAND_BODIES):
             self._external_force[:, self.model.body(name).id, :3] = force[:, hand].cpu().numpy()
 
@@ -233,7 +233,7 @@ class BatchSimulation:
         self._qvel[rows, qvel] = 0.0
 
     def per_robot(self, field: str) -> np.ndarray:
-        """A model field with one row per robot, to be written in place for domain randomisation."""
+        """A model field with one row per robot, to be written in place for domain randomization."""
         if field not in self._per_robot_fields:
             self._per_robot_fields[field] = self._batch.expand(field)
         return self._per_robot_fields[field]

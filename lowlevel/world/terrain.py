@@ -25,7 +25,7 @@ STANCE_REACH = 0.3
 
 @dataclass(frozen=True)
 class Block:
-    """An axis-aligned box standing on the ground plane: centre (x, y), half extents (x, y), top height [m]."""
+    """An axis-aligned box standing on the ground plane: center (x, y), half extents (x, y), top height [m]."""
 
     center: tuple[float, float]
     half_extent: tuple[float, float]
@@ -89,10 +89,10 @@ class Terrain:
         self.tile_centers = torch.tensor(centers, dtype=torch.float32, device=device)
         self._origin = torch.tensor([-size / 2, -size * len(config.tiles) / 2], device=device)
         # The outermost cells stand for the plane around the tiles.
-        self._raster = torch.from_numpy(np.pad(self._rasterise(), 1)).to(device)
+        self._raster = torch.from_numpy(np.pad(self._rasterize(), 1)).to(device)
         self._map_offsets = map_points(device)
 
-    def _rasterise(self) -> np.ndarray:
+    def _rasterize(self) -> np.ndarray:
         config, resolution = self.config, self.config.raster_resolution
         shape = (
             round(config.tile_size / resolution),

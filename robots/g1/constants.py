@@ -101,18 +101,18 @@ HAND_BODIES = ("left_wrist_yaw_link", "right_wrist_yaw_link")
 SIDES = ("left", "right")
 
 SOLE_OFFSET = -0.035
-"""Height of the sole in the ankle-roll frame [m]: the URDF's foot spheres, centre -0.030, radius 0.005."""
+"""Height of the sole in the ankle-roll frame [m]: the URDF's foot spheres, center -0.030, radius 0.005."""
 SOLE_CENTER = 0.035
 """Middle of the sole ahead of the ankle-roll frame [m]; the foot sites lie there."""
 PALM_HALF_THICKNESS = 0.012
-"""Of the palm plates [m]: the surface that touches lies this far from the palm centre along the palm normal."""
+"""Of the palm plates [m]: the surface that touches lies this far from the palm center along the palm normal."""
 PALM_OFFSET = (0.09, 0.0, 0.0)
-"""Palm centre in the wrist-yaw frame [m]; the palm normal is -y on the left hand, +y on the right."""
+"""Palm center in the wrist-yaw frame [m]; the palm normal is -y on the left hand, +y on the right."""
 
 
 @dataclass(frozen=True)
 class BodyPoint:
-    """A ball that stands for a part of the robot: centre in the frame of ``body`` [m], and ``radius`` [m]."""
+    """A ball that stands for a part of the robot: center in the frame of ``body`` [m], and ``radius`` [m]."""
 
     name: str
     body: str

@@ -31,7 +31,7 @@ from robots.g1.constants import (
 )
 
 PALM_FRAMES = ("left_palm", "right_palm")
-"""Palm centres, with the axes of the wrist-yaw links."""
+"""Palm centers, with the axes of the wrist-yaw links."""
 FRAMES = (PELVIS_BODY, TORSO_BODY, *FOOT_BODIES, *PALM_FRAMES)
 """Frames that :class:`Kinematics` reports: pelvis, torso, feet (ankle-roll links) and palms."""
 

@@ -40,7 +40,7 @@ PALM_COLLISION = 2
 _FOOT_SPHERES = ((-0.05, 0.025), (-0.05, -0.025), (0.12, 0.03), (0.12, -0.03))
 _FOOT_SPHERE_RADIUS = 0.02
 """Edge radius of the sole [m]. It must exceed what a foot sinks in on impact: the URDF's 5 mm spheres sink below the
-top of the next slab and are stopped by its side, even where slabs differ by a millimetre."""
+top of the next slab and are stopped by its side, even where slabs differ by a millimeter."""
 _FOOT_SPHERE_HEIGHT = SOLE_OFFSET + _FOOT_SPHERE_RADIUS
 
 
@@ -149,7 +149,7 @@ def _add_feet(spec: mujoco.MjSpec, options: ModelOptions) -> None:
             sphere.mass = 0.0
             sphere.contype, sphere.conaffinity = WORLD_COLLISION, 0
             sphere.condim = 3
-            # A foot's friction is its own, not the larger of foot and ground, so that it can be randomised.
+            # A foot's friction is its own, not the larger of foot and ground, so that it can be randomized.
             sphere.priority = 1
             sphere.friction = [options.friction, 0.005, 0.0001]
             sphere.group = 3

@@ -47,7 +47,7 @@ class Axis:
 
     @property
     def step(self) -> float:
-        """Distance between neighbouring nodes."""
+        """Distance between neighboring nodes."""
         return (self.stop - self.start) / (self.size - 1)
 
 

@@ -35,20 +35,20 @@ def _posture(node: tuple[int, ...]) -> np.ndarray:
     return np.array([axis[i] for axis, i in zip((HEIGHT, ROLL, PITCH, YAW), node, strict=True)])
 
 
-def _inward_neighbours(node: tuple[int, ...]) -> list[tuple[int, ...]]:
-    neighbours = []
-    for axis, (index, centre) in enumerate(zip(node, _CENTRE, strict=True)):
-        if index != centre:
-            step = 1 if index < centre else -1
-            neighbours.append((*node[:axis], index + step, *node[axis + 1 :]))
-    return neighbours
+def _inward_neighbors(node: tuple[int, ...]) -> list[tuple[int, ...]]:
+    neighbors = []
+    for axis, (index, center) in enumerate(zip(node, _CENTRE, strict=True)):
+        if index != center:
+            step = 1 if index < center else -1
+            neighbors.append((*node[:axis], index + step, *node[axis + 1 :]))
+    return neighbors
 
 
 def solve_grid(solver: StanceSolver) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Joint positions, gravity torques (*SHAPE, 15) [rad, N m] and soundness (*SHAPE,) of every node.
 
-    Each node starts from a neighbour nearer to standing. Half of the grid is solved and the other half
-    mirrored; the robot's own small asymmetry (0.1 mm in its centre of mass) is thereby left out of the table.
+    Each node starts from a neighbor nearer to standing. Half of the grid is solved and the other half
+    mirrored; the robot's own small asymmetry (0.1 mm in its center of mass) is thereby left out of the table.
     """
     _, roll, _, yaw = np.indices(SHAPE, sparse=True)
     straight = np.broadcast_to((roll == _CENTRE[1]) & (yaw == _CENTRE[3]), SHAPE)
@@ -57,7 +57,7 @@ def solve_grid(solver: StanceSolver) -> tuple[np.ndarray, np.ndarray, np.ndarray
     nodes.sort(key=lambda node: sum(abs(i - c) for i, c in zip(node, _CENTRE, strict=True)))
     stances: dict[tuple[int, ...], Stance] = {}
     for node in nodes:
-        solved = [stances[neighbour] for neighbour in _inward_neighbours(node) if neighbour in stances]
+        solved = [stances[neighbor] for neighbor in _inward_neighbors(node) if neighbor in stances]
         solved.sort(key=lambda stance: not stance.is_sound())
         starts: list[np.ndarray | None] = [stance.unknowns for stance in solved]
         for start in starts or [None]:

@@ -1,7 +1,7 @@
 """Inverse kinematics of a balanced double stance: leg and waist joints for one torso posture.
 
 A posture (h, roll, pitch, yaw) leaves the G1 four degrees of freedom: how pelvis and waist share the torso's
-roll and pitch, and where the centre of mass sits over the feet. A regularised least-squares problem chooses
+roll and pitch, and where the center of mass sits over the feet. A regularized least-squares problem chooses
 among them. Its unknowns are the pelvis's x, y, roll and pitch and the 15 leg and waist joints; the pelvis's
 height is h and its yaw is zero by construction, so that the heading frame is the world frame. The ground is
 at z = 0 and the ankles are at x = 0.
@@ -30,7 +30,7 @@ STANCE_HALF_WIDTH = 0.12
 CONTACT_POINTS = np.array([[-0.05, -0.025], [-0.05, 0.025], [0.12, -0.03], [0.12, 0.03]])
 """Contact points of a sole in the ankle-roll frame, x and y [m]: the URDF's foot spheres."""
 COM_MARGIN = 0.02
-"""Least distance of the centre of mass from the border of the support polygon [m]."""
+"""Least distance of the center of mass from the border of the support polygon [m]."""
 LIMIT_MARGIN = 0.02
 """Least distance of a joint from its limits [rad]."""
 FOOT_TOLERANCE = 1e-3
@@ -42,7 +42,7 @@ _COM_TARGET = np.array([0.03, 0.0])
 # The band around the support polygon's core in which leaving it starts to cost [m].
 _COM_BOX = np.array([[-0.027, -0.11], [0.097, 0.11]])
 _LIMIT_BAND = 0.06
-# Weights per metre or radian. Feet and torso are constraints in all but name.
+# Weights per meter or radian. Feet and torso are constraints in all but name.
 _CONSTRAINT_WEIGHT = 1000.0
 _COM_WEIGHT, _COM_BOX_WEIGHT = 10.0, 200.0
 _LIMIT_WEIGHT = 20.0

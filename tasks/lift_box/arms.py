@@ -23,14 +23,14 @@ _WAIST_SIZE, _ARM_SIZE = 3, 7
 
 @dataclass(frozen=True)
 class PalmPose:
-    """Palm centres of N robots, left then right, with the axes of the wrist-yaw links (fingers +x)."""
+    """Palm centers of N robots, left then right, with the axes of the wrist-yaw links (fingers +x)."""
 
     position: Tensor
     """(N, 2, 3) [m]"""
     rotation: Tensor
     """(N, 2, 3, 3)"""
     jacobian: Tensor
-    """By the 7 arm joints (N, 2, 6, 7): velocity of the centre, then angular velocity, in the frame of
+    """By the 7 arm joints (N, 2, 6, 7): velocity of the center, then angular velocity, in the frame of
     ``position``."""
     shoulder: Tensor
     """First joint of each arm (N, 2, 3) [m]."""
@@ -38,7 +38,7 @@ class PalmPose:
 
 @dataclass(frozen=True)
 class InverseConfig:
-    """Damped least squares for the arms; weights are per metre and per radian."""
+    """Damped least squares for the arms; weights are per meter and per radian."""
 
     position_weight: float = 20.0
     normal_weight: float = 4.0
@@ -113,7 +113,7 @@ class ArmKinematics:
             waist: waist joints (N, 3) [rad], which stay.
             start: where the iteration starts (N, 14) [rad].
             rest: preferred posture (N, 14) or (14,) [rad].
-            position: palm centres [m].
+            position: palm centers [m].
             rotation: palm axes.
 
         Returns:

@@ -17,7 +17,7 @@ class SpawnConfig:
     mass: Range = (0.5, 2.0)
     """[kg]"""
     center_of_mass: float = 0.02
-    """Half range of the offset of the centre of mass, per axis [m]."""
+    """Half range of the offset of the center of mass, per axis [m]."""
     friction: Range = (0.5, 1.2)
     """Sliding friction of the palms."""
     floor_share: float = 0.5
@@ -59,7 +59,7 @@ class StageConfig:
     approach_distance: float = 0.45
     """Largest distance of the near face ahead of the pelvis [m]."""
     approach_lateral: float = 0.10
-    """Largest lateral offset of its centre [m]."""
+    """Largest lateral offset of its center [m]."""
     approach_yaw: float = 0.26
     """Largest yaw between robot and box [rad]."""
     approach_speed: float = 0.15
@@ -115,7 +115,7 @@ class RewardConfig:
     force_limit: float = 60.0
     """[N]"""
     box_moved: float = -1.0
-    """Per metre beyond 5 cm that the box has moved before it is grasped."""
+    """Per meter beyond 5 cm that the box has moved before it is grasped."""
     box_tilt: float = -0.5
     """Per radian of tilt beyond 0.5."""
     grasp_force: float = 15.0

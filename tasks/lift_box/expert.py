@@ -249,7 +249,7 @@ class LiftBoxExpert:
         wide = config.wide * _smooth((4.0 * (1.0 - memory.descent)).clamp(0.0, 1.0)) * ~lifting
         apart = 0.5 * episode.size[:, 1] - memory.depth + wide
         side = torch.tensor([1.0, -1.0])
-        # The kinematic palm centre lies inside the hand, behind the surface that touches.
+        # The kinematic palm center lies inside the hand, behind the surface that touches.
         offset = side[None, :, None] * (apart + PALM_HALF_THICKNESS)[:, None, None] * left[:, None]
         target = middle[:, None] + offset
         target = self._within_reach(target, measured)

@@ -34,13 +34,13 @@ class Situation:
     box_pose: Tensor
     """World (N, 7) [m], wxyz."""
     near_face: Tensor
-    """Centre of the box's -x face from the pelvis (N, 3) [m]."""
+    """Center of the box's -x face from the pelvis (N, 3) [m]."""
     yaw_error: Tensor
     """Yaw of the box relative to the robot (N,) [rad]."""
     speed: Tensor
     """Horizontal speed of the pelvis (N,) [m/s]."""
     palm_offset: Tensor
-    """From each palm to the centre of its own side face (N, 2, 3) [m]; left palm and +y face, right palm and
+    """From each palm to the center of its own side face (N, 2, 3) [m]; left palm and +y face, right palm and
     -y face."""
     palm_distance: Tensor
     """From each palm to its own side face (N, 2) [m]."""

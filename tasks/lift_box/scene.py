@@ -38,7 +38,7 @@ def add_box_scene(spec: mujoco.MjSpec) -> None:
 
     body = spec.worldbody.add_body(name=BOX, pos=[0.0, 0.0, half])
     body.add_freejoint(name=BOX)
-    body.simple = False  # its centre of mass will not stay at its origin
+    body.simple = False  # its center of mass will not stay at its origin
     box = body.add_geom(name=BOX, type=mujoco.mjtGeom.mjGEOM_BOX, size=[half, half, half], mass=NOMINAL_MASS)
     box.contype, box.conaffinity = WORLD_COLLISION, WORLD_COLLISION | PALM_COLLISION
     box.condim = 4

@@ -1,4 +1,4 @@
-"""Lift-box as the planner's environment sees it: scene, episodes, observation, reward and judgement."""
+"""Lift-box as the planner's environment sees it: scene, episodes, observation, reward and judgment."""
 
 from __future__ import annotations
 

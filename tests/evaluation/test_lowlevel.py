@@ -20,7 +20,7 @@ from evaluation.protocols.skills import BARS
 from evaluation.protocols.tracking import (
     FIGURES,
     GROUPS,
-    energy_per_metre,
+    energy_per_meter,
     group_of,
     mode_episodes,
     motion_modes,
@@ -128,7 +128,7 @@ def test_the_table_agrees_with_a_plain_recount(arena: Arena, controller: Control
             drift = np.abs(np.mean(signed[:25], axis=0))
             assert table.columns["E_v_mean"][line] == pytest.approx(drift[0] + drift[1], rel=1e-3)
             assert table.columns["E_omega_mean"][line] == pytest.approx(drift[2], rel=1e-3, abs=1e-6)
-    assert table.columns["fell"][0] == 1.0, "twelve metres per second sideways fell nobody"
+    assert table.columns["fell"][0] == 1.0, "twelve meters per second sideways fell nobody"
     assert np.isfinite(table.columns["E_v"][1]), "the fallen robot's next command counts, too"
     assert np.isnan(table.columns["E_v_steady"]).all(), "0.6 s are all transient"
     assert transient.shape == (30, len(TRACKING_FIGURES)) and np.isfinite(transient).all()
@@ -172,19 +172,19 @@ def test_a_controller_does_not_differ_from_itself_and_pairs_must_match(arena: Ar
         paired_differences(table, run_tracking(arena, episodes[:2])[0])
 
 
-def test_energy_per_metre_is_a_ratio_of_sums() -> None:
+def test_energy_per_meter_is_a_ratio_of_sums() -> None:
     """A still episode and one without translation commands change nothing; the interval is that of the ratio."""
-    figure = energy_per_metre(np.array([400.0, 0.0, 800.0, 100.0]), np.array([2.0, 0.0, 3.0, 0.0]))
+    figure = energy_per_meter(np.array([400.0, 0.0, 800.0, 100.0]), np.array([2.0, 0.0, 3.0, 0.0]))
     assert figure.value == pytest.approx(1300.0 / 5.0) and figure.n == 3 and figure.unit == "J/m"
     rng = np.random.default_rng(0)
     way = rng.uniform(1.0, 9.0, 300)
     energy = 200.0 * way + rng.normal(0.0, 60.0, 300)
-    figure = energy_per_metre(energy, way)
+    figure = energy_per_meter(energy, way)
     picks = rng.integers(0, 300, (4000, 300))
     low, high = np.percentile(energy[picks].sum(axis=1) / way[picks].sum(axis=1), [2.5, 97.5])
     assert figure.ci95 is not None
     assert figure.ci95 == pytest.approx((low, high), abs=0.1 * (high - low))
-    assert energy_per_metre(np.array([50.0]), np.array([-0.1])).value is None, "went backwards"
+    assert energy_per_meter(np.array([50.0]), np.array([-0.1])).value is None, "went backwards"
 
 
 def test_walking_counts_falls_and_speed(arena: Arena, controller: Controller) -> None:
@@ -274,7 +274,7 @@ def test_command_writes_a_report(
     low, high = content["figures"]["E_v"]["ci95"]
     assert low <= content["figures"]["E_v"]["value"] <= high
     assert {"E_stumble", "fall_rate", "E_arm_steady", "walk_half_mps_survival"} <= set(content["figures"])
-    assert {"energy_per_metre", "action_rate", *BARS} <= set(content["figures"])
+    assert {"energy_per_meter", "action_rate", *BARS} <= set(content["figures"])
     assert content["figures"]["push_success"]["n"] == 1
     (difference,) = content["differences"].values()
     assert difference["E_v"]["value"] == 0.0

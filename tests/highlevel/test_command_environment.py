@@ -102,7 +102,7 @@ def test_the_observed_previous_command_is_the_limited_and_feasible_one(make_envi
     names = [block.name for block in environment.blocks]
     start = sum(block.size for block in environment.blocks[: names.index("previous_command")])
     seen = result.final_observation[:, start : start + 21]
-    torch.testing.assert_close(seen, environment.action_map.normalise(environment.command))
+    torch.testing.assert_close(seen, environment.action_map.normalize(environment.command))
     assert torch.allclose(environment.command[:, HEIGHT], torch.tensor(0.72), atol=1e-4)
     clamped = environment.controller.clamp_command(environment.command)
     torch.testing.assert_close(clamped, environment.command)

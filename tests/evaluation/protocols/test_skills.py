@@ -239,7 +239,7 @@ def test_a_trace_is_what_was_measured_and_ends_with_a_fall(controller: Controlle
     trace = record(arena, episodes, CHANNELS)
     assert trace.fell.any(axis=1).tolist() == [True, False, False]
     last = int(np.isfinite(trace["height_error"][0]).sum())
-    assert 0 < last < 25, "twelve metres per second sideways fell nobody"
+    assert 0 < last < 25, "twelve meters per second sideways fell nobody"
     for channel in trace.channels.values():
         assert np.isfinite(channel[0, :last]).all() and np.isnan(channel[0, last:]).all()
         assert np.isfinite(channel[1:]).all()

@@ -1,4 +1,4 @@
-"""Demonstrations and behaviour cloning, on a target that can be computed by hand."""
+"""Demonstrations and behavior cloning, on a target that can be computed by hand."""
 
 from __future__ import annotations
 
@@ -115,8 +115,8 @@ def test_cloning_learns_a_known_policy_and_its_value(make_environment: Make, sou
     assert result.held_out_error < 0.35 < action.std()
     assert result.value_error < 0.3 * demonstrations.value.std()
     torch.testing.assert_close(model.policy.log_std.detach(), std_before)
-    normaliser = model.policy.features_extractor
-    torch.testing.assert_close(normaliser.mean, torch.full((size,), 3.0), atol=0.2, rtol=0)
+    normalizer = model.policy.features_extractor
+    torch.testing.assert_close(normalizer.mean, torch.full((size,), 3.0), atol=0.2, rtol=0)
 
 
 def test_cloning_refuses_foreign_demonstrations(make_environment: Make, source: Source) -> None:

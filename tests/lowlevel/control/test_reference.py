@@ -63,8 +63,8 @@ def test_the_clock_runs_at_its_frequency(reference: Reference, space: CommandSpa
     for _ in range(50):
         state = reference.advance(state, walk)
         phases.append(state.phase.item())
-    travelled = np.unwrap(phases)[-1]
-    assert travelled == pytest.approx(2.0 * math.pi * CONFIG.gait_frequency, rel=1e-3)
+    traveled = np.unwrap(phases)[-1]
+    assert traveled == pytest.approx(2.0 * math.pi * CONFIG.gait_frequency, rel=1e-3)
 
 
 @pytest.mark.parametrize("steps", [20, 30, 40, 47])

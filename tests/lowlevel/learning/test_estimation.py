@@ -71,7 +71,7 @@ def _train(shuffled: bool) -> EstimationTerms:
         optimizer.zero_grad()
         terms.loss.backward()
         optimizer.step()
-        target_encoder.renormalise_prototypes()
+        target_encoder.renormalize_prototypes()
     return EstimationTerms(*(term.detach() for term in terms))
 
 

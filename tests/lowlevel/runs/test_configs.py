@@ -19,7 +19,7 @@ def test_a_configuration_comes_back_from_json_as_it_was() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda prior: prior | {"colour": 1}, "GaitPriorConfig has no field 'colour'"),
+        (lambda prior: prior | {"color": 1}, "GaitPriorConfig has no field 'color'"),
         (lambda prior: {k: v for k, v in prior.items() if k != "lift"}, "GaitPriorConfig lacks its field 'lift'"),
     ],
 )

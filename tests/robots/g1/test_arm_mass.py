@@ -1,4 +1,4 @@
-"""Holding torques of the arms against Pinocchio's generalised gravity."""
+"""Holding torques of the arms against Pinocchio's generalized gravity."""
 
 import numpy as np
 import pinocchio as pin

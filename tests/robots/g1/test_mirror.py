@@ -32,7 +32,7 @@ CONFIGURATION_MIRROR = concatenate(VECTOR, QUATERNION_MIRROR, JOINTS_MIRROR)
 
 POSES = 100
 PLACEMENT_TOLERANCE = 3e-5
-"""Metres and rotation-matrix entries; measured 1.0e-5."""
+"""Meters and rotation-matrix entries; measured 1.0e-5."""
 DYNAMICS_TOLERANCE = 0.008
 """Of the greatest magnitude of each component; measured 0.0038 at most over five seeds."""
 

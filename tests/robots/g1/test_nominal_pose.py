@@ -316,7 +316,7 @@ def test_table_is_what_the_solver_computes(table: dict[str, np.ndarray]) -> None
         np.testing.assert_allclose(stance.torques, table["torques"][tuple(node)], atol=0.1)
 
 
-def test_unsound_nodes_hold_a_sound_neighbour(table: dict[str, np.ndarray]) -> None:
+def test_unsound_nodes_hold_a_sound_neighbor(table: dict[str, np.ndarray]) -> None:
     values = np.full(table["positions"].shape, np.nan)
     values[table["sound"]] = table["positions"][table["sound"]]
     fill_unsound(values, table["sound"])

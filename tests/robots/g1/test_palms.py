@@ -51,7 +51,7 @@ def _squeeze_box(friction: float, mass: float = 1.0, seconds: float = 2.5) -> tu
     return np.array(box_height), np.array(palm_height)
 
 
-def test_palms_hold_a_box_for_two_seconds_with_less_than_five_millimetres_of_slip() -> None:
+def test_palms_hold_a_box_for_two_seconds_with_less_than_five_millimeters_of_slip() -> None:
     box, palms = _squeeze_box(friction=0.8)
     relative = (box - palms)[250:]
     assert np.abs(relative - relative[0]).max() < 0.005

@@ -74,7 +74,7 @@ def test_impossible_posture_is_not_sound(solver: StanceSolver, posture: tuple[fl
 
 
 def test_balance_and_torques_of_a_squat(solver: StanceSolver) -> None:
-    """Moments by hand: each ankle carries half of the weight at the lever of the centre of mass."""
+    """Moments by hand: each ankle carries half of the weight at the lever of the center of mass."""
     stance = solver.solve(np.array([0.5, 0.0, 0.3, 0.0]))
     com_x = pin.centerOfMass(solver.model, solver.data, solver.configuration(0.5, stance.unknowns))[0]
     weight = TOTAL_MASS * 9.81
