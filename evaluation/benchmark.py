@@ -41,7 +41,7 @@ from evaluation.reporting.reports import (
     write_results,
 )
 from evaluation.reporting.statistics import Figure, mean_figure
-from highlevel.task import load_task
+from highlevel.registry import load_task
 from lowlevel.control.controller import Controller, content_hash
 from lowlevel.export import export_controller
 from lowlevel.presets import PRESETS

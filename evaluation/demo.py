@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -28,7 +26,8 @@ from evaluation.reporting.reports import (
 from highlevel.action import interpolate
 from highlevel.environment import CommandEnvironment, PhysicsConfig, StepResult
 from highlevel.planner import planner_hash
-from highlevel.task import Decision, Outcome, Task, load_task, rows
+from highlevel.registry import load_task
+from highlevel.task import Decision, rows
 from lowlevel.control.controller import content_hash
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.progress import ProgressReport
@@ -64,7 +63,7 @@ class Arguments:
 
 
 @dataclass(frozen=True)
-class Story:
+class EpisodeSummary:
     """How an episode went."""
 
     success: bool
@@ -76,22 +75,6 @@ class Story:
     """When each stage was passed [s]."""
     instants: dict[str, np.ndarray]
     """Coordinates of the scene at the start, at every stage and at the end."""
-
-
-class WatchedTask:
-    """A task that shows every control step to ``see``; everything else is the task's own."""
-
-    def __init__(self, task: Task, see: Callable[[Measurement, Decision], None]) -> None:
-        self._task, self._see = task, see
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._task, name)
-
-    def step(self, measured: Measurement, decision: Decision) -> Outcome:
-        """Judge one control step, then show it."""
-        outcome = self._task.step(measured, decision)
-        self._see(measured, decision)
-        return outcome
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -109,24 +92,24 @@ def _run(arguments: Arguments) -> None:
     folder = controller_for(arguments.planner, arguments.controller)
     torch.set_num_threads(1)
     print(f"running {arguments.planner} on {arguments.task}, episode {arguments.episode}", flush=True)
-    stories: list[Story] = []
+    summaries: list[EpisodeSummary] = []
 
     def write(output: Path) -> None:
-        story, twin = run_episode(arguments, folder, output / RECORDING_FILE)
-        pictures = draw(twin, story, output) if arguments.pictures else []
-        (output / REPORT_FILE).write_text(report_text(arguments, story, folder, pictures))
-        outcome = {name: value for name, value in asdict(story).items() if name != "instants"}
+        summary, twin = run_episode(arguments, folder, output / RECORDING_FILE)
+        pictures = draw(twin, summary, output) if arguments.pictures else []
+        (output / REPORT_FILE).write_text(report_text(arguments, summary, folder, pictures))
+        outcome = {name: value for name, value in asdict(summary).items() if name != "instants"}
         write_json(output / OUTCOME_FILE, outcome | identities(arguments, folder))
-        stories.append(story)
+        summaries.append(summary)
 
     write_results(arguments.output, write)
-    print(outcome_text(stories[0]))
+    print(outcome_text(summaries[0]))
     print(f"recording: {arguments.output / RECORDING_FILE}   report: {arguments.output / REPORT_FILE}")
     # It may lie in a virtual environment that is not active.
     print(f"watch it with: {Path(sys.executable).with_name('rerun')} {arguments.output / RECORDING_FILE}")
 
 
-def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tuple[Story, VisualTwin]:
+def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tuple[EpisodeSummary, VisualTwin]:
     """Run the episode and write the ``recording``; also returns the scene's visual double."""
     control_steps = 0
     stage_times: dict[str, float] = {}
@@ -156,7 +139,7 @@ def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tupl
 
     task = load_task(arguments.task)
     physics = PhysicsConfig(num_threads=arguments.threads)
-    environment = CommandEnvironment(cast(Task, WatchedTask(task, see)), controller, physics=physics)
+    environment = CommandEnvironment(task, controller, physics=physics)
     policy = make_policy(arguments.planner, environment, controller)
     observation = environment.reset(arguments.seed)
     for _ in range(arguments.episode):
@@ -175,22 +158,22 @@ def run_episode(arguments: Arguments, controller: Path, recording: Path) -> tupl
         bar = progress.add_task("episode", total=environment.max_decisions)
         film = EpisodeRecording(recorder, twin, environment.controller.experts)
         while result is None or not bool(result.done[0]):
-            result = environment.step(policy.act(observation), auto_reset=False)
+            result = environment.step(policy.act(observation), auto_reset=False, observers=(see,))
             observation = result.observation
             progress.update(bar, advance=1)
         progress.update(bar, completed=environment.max_decisions)
     instants["end"] = environment.simulation.robot_data(0).qpos.copy()
-    story = Story(
+    summary = EpisodeSummary(
         success=bool(result.success[0]),
         failure=result.failures.get(0),
         duration=float(result.duration[0]),
         stage_times=stage_times,
         instants=instants,
     )
-    return story, twin
+    return summary, twin
 
 
-def draw(twin: VisualTwin, story: Story, output: Path) -> list[str]:
+def draw(twin: VisualTwin, summary: EpisodeSummary, output: Path) -> list[str]:
     """Draw all instants, and those of the stages side by side; returns the names of the pictures.
 
     There are none if this machine cannot render.
@@ -199,13 +182,13 @@ def draw(twin: VisualTwin, story: Story, output: Path) -> list[str]:
     stages: list[np.ndarray] = []
     try:
         with Painter(twin.model) as painter:
-            for number, (instant, position) in enumerate(story.instants.items()):
+            for number, (instant, position) in enumerate(summary.instants.items()):
                 twin.data.qpos[:] = position
                 mujoco.mj_forward(twin.model, twin.data)
                 pixels = painter.draw(twin.data, following_camera(twin.model, twin.data))
                 names.append(f"{number}_{instant}.png")
                 save_picture(output / names[-1], pixels)
-                if instant in story.stage_times:
+                if instant in summary.stage_times:
                     stages.append(pixels)
         if stages:
             names.insert(0, STRIP_FILE)
@@ -227,20 +210,20 @@ def identities(arguments: Arguments, controller: Path) -> dict[str, str | int]:
     }
 
 
-def outcome_text(story: Story) -> str:
+def outcome_text(summary: EpisodeSummary) -> str:
     """The outcome in one line."""
-    if story.success:
-        return f"success after {story.duration:.1f} s"
-    last = f"after the stage {list(story.stage_times)[-1]!r}" if story.stage_times else "before the first stage"
-    return f"failure ({story.failure}) after {story.duration:.1f} s, {last}"
+    if summary.success:
+        return f"success after {summary.duration:.1f} s"
+    last = f"after the stage {list(summary.stage_times)[-1]!r}" if summary.stage_times else "before the first stage"
+    return f"failure ({summary.failure}) after {summary.duration:.1f} s, {last}"
 
 
-def report_text(arguments: Arguments, story: Story, controller: Path, pictures: list[str]) -> str:
+def report_text(arguments: Arguments, summary: EpisodeSummary, controller: Path, pictures: list[str]) -> str:
     """``report.md``."""
     made_by = identities(arguments, controller)
-    stages = [[stage, f"{seconds:.2f}"] for stage, seconds in story.stage_times.items()]
+    stages = [[stage, f"{seconds:.2f}"] for stage, seconds in summary.stage_times.items()]
     lines = [
-        f"# {arguments.task.replace('_', ' ').capitalize()}: {outcome_text(story)}",
+        f"# {arguments.task.replace('_', ' ').capitalize()}: {outcome_text(summary)}",
         "",
         f"Planner `{made_by['planner']}` on controller `{made_by['controller']}`, seed {arguments.seed}, "
         f"episode {arguments.episode}. Recording: `{RECORDING_FILE}`, open it with `rerun {RECORDING_FILE}`.",

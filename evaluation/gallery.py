@@ -16,7 +16,7 @@ from evaluation.pictures.visuals import VisualTwin
 from evaluation.protocols.arena import Arena, constant
 from evaluation.protocols.skills import HOLDING_ARMS
 from evaluation.reporting.reports import check_output
-from highlevel.registration import find_controller
+from highlevel.registry import find_controller
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.control.controller import Controller
 from lowlevel.runs.command_line import command_line

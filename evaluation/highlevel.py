@@ -31,7 +31,8 @@ from evaluation.reporting.reports import (
 from evaluation.reporting.statistics import Figure, mean_figure, share_figure
 from highlevel.episodes import EpisodeRecord
 from highlevel.planner import planner_hash
-from highlevel.task import Task, load_task
+from highlevel.registry import load_task
+from highlevel.task import Task
 from lowlevel.control.controller import content_hash
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.progress import ProgressReport

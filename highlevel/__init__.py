@@ -3,6 +3,6 @@
 Importing this package registers every task as a Gymnasium environment, such as ``pilot/LiftBox-v0``.
 """
 
-from highlevel.registration import register_tasks
+from highlevel.registry import register_tasks
 
 register_tasks()

@@ -8,6 +8,7 @@ up, and an episode may end inside the option.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,6 +35,11 @@ ROBOT_BLOCKS = (
 )
 """The robot's part of the paper's planner observation: joint positions relative to the default pose, and the
 limited command in units of the action."""
+
+
+ControlObserver = Callable[[Measurement, Decision], None]
+"""Called after every control step, once the task has judged it, with what was measured and the decision it is part of.
+"""
 
 
 @dataclass(frozen=True)
@@ -164,10 +170,11 @@ class CommandEnvironment:
     # -- stepping --------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def step(self, action: Tensor, auto_reset: bool = True) -> StepResult:
+    def step(self, action: Tensor, auto_reset: bool = True, observers: Sequence[ControlObserver] = ()) -> StepResult:
         """One decision: ``action`` (N, 21) in [-1, 1], held as an option of several control steps.
 
-        With ``auto_reset``, robots whose episode ended begin their next one before this returns.
+        With ``auto_reset``, robots whose episode ended begin their next one before this returns. ``observers`` see
+        every control step.
 
         Raises:
             RuntimeError: if :meth:`reset` was not called.
@@ -206,6 +213,8 @@ class CommandEnvironment:
             self.measured = self.world.advance(targets)
             falls = self.world.fallen(self.measured)
             outcome = self.task.step(self.measured, decision)
+            for observe in observers:
+                observe(self.measured, decision)
             reward += torch.where(ended, 0.0, torch.where(falls, self.task.fall_penalty, outcome.reward))
             now = (falls | outcome.success | outcome.failure) & ~ended
             if bool(now.any()):

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from highlevel.environment import CommandEnvironment, PhysicsConfig
-from highlevel.registration import find_controller
-from highlevel.task import Task, load_task
+from highlevel.registry import find_controller, load_task
+from highlevel.task import Task
 from lowlevel.commands import COMMAND_SIZE
 from lowlevel.control.controller import Controller
 from robots.errors import PilotError

@@ -1,18 +1,10 @@
-"""What a task is to the planner's environment, and how tasks are found by name.
-
-A task is a folder ``tasks/<name>/`` whose package has an attribute ``TASK``: a function without required
-arguments that returns a :class:`Task`. Nothing under ``highlevel`` knows a task by name.
-"""
+"""What a task is to the planner's environment."""
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import mujoco
@@ -22,7 +14,6 @@ from torch import Tensor
 from highlevel.action import ActionConfig
 from lowlevel.world.measures import Measurement
 from lowlevel.world.simulation import BatchSimulation
-from robots.errors import PilotError
 
 
 @dataclass(frozen=True)
@@ -162,43 +153,6 @@ class Task(ABC):
     def conditions(self) -> dict[str, Tensor]:
         """What was drawn for each robot's episode (N,), by name and unit; reports show it beside a failure."""
         return {}
-
-    def expert(self, environment: Any) -> Any:
-        """A scripted :class:`highlevel.episodes.Policy` for a ``CommandEnvironment`` of this task.
-
-        Raises:
-            PilotError: if the task has none, as by default.
-        """
-        raise PilotError(f"task {self.name!r} has no scripted expert: train it with --demonstrations 0")
-
-
-def task_names() -> list[str]:
-    """Names of the tasks that are installed."""
-    package = importlib.import_module("tasks")
-    return sorted(module.name for module in pkgutil.iter_modules(package.__path__) if module.ispkg)
-
-
-def load_task(name: str, **options: Any) -> Task:
-    """The task in folder ``tasks/<name>``; ``options`` go to its ``TASK``.
-
-    Raises:
-        PilotError: if there is no such task, or the folder does not hold one.
-    """
-    if name not in task_names():
-        raise PilotError(f"there is no task {name!r}; the tasks are: {', '.join(task_names()) or 'none'}")
-    module: ModuleType = importlib.import_module(f"tasks.{name}")
-    factory = getattr(module, "TASK", None)
-    if factory is None:
-        raise PilotError(f"tasks/{name}/__init__.py has no attribute TASK: it must name the task's class")
-    task = factory(**options)
-    if not isinstance(task, Task):
-        raise PilotError(f"TASK of tasks/{name} makes a {type(task).__name__}, not a highlevel.task.Task")
-    return task
-
-
-def environment_id(name: str) -> str:
-    """Gymnasium id of a task: ``lift_box`` is ``pilot/LiftBox-v0``."""
-    return f"pilot/{''.join(word.capitalize() for word in name.split('_'))}-v0"
 
 
 def rows(count: int) -> Tensor:

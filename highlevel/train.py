@@ -13,7 +13,7 @@ import tyro
 
 from highlevel.learning.config import PlannerTrainingConfig
 from highlevel.learning.demonstrations import Demonstrations
-from highlevel.registration import find_controller
+from highlevel.registry import find_controller
 from highlevel.trainer import BEST_FOLDER, PlannerTrainer
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.run_folder import RunFolder, resumed_run

@@ -22,7 +22,7 @@ from highlevel.learning.demonstrations import Demonstrations, Source, record
 from highlevel.learning.policy import PlannerActor
 from highlevel.learning.ppo import PlannerPPO
 from highlevel.planner import Planner, PlannerConfig
-from highlevel.task import load_task
+from highlevel.registry import load_expert, load_task
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.control.controller import Controller, content_hash
 from lowlevel.runs.interrupts import stop_on_signals
@@ -155,7 +155,7 @@ class PlannerTrainer:
 
             recorded = record(
                 self.environment,
-                self.environment.task.expert(self.environment),
+                load_expert(self.environment),
                 wanted,
                 DEMONSTRATION_SEED + config.seed + (done.attempts if done else 0),
                 config.demonstration_noise,

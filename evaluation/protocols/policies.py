@@ -7,7 +7,7 @@ from pathlib import Path
 from highlevel.environment import CommandEnvironment
 from highlevel.episodes import Policy
 from highlevel.planner import Planner
-from highlevel.registration import find_controller
+from highlevel.registry import find_controller, load_expert
 from lowlevel.control.controller import Controller
 
 SCRIPTED = "scripted"
@@ -35,8 +35,7 @@ def make_policy(planner: str, environment: CommandEnvironment, controller: Path)
         PlannerError: if the planner does not belong to this task and controller.
     """
     if planner == SCRIPTED:
-        expert: Policy = environment.task.expert(environment)
-        return expert
+        return load_expert(environment)
     loaded = Planner.load(planner, controller)
     loaded.require_environment(environment)
     return loaded

@@ -16,7 +16,7 @@ from evaluation.protocols.plain_env import PlainMujocoEnv
 from evaluation.reporting.statistics import Figure, mean_figure, quantile_figure
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.gym_env import PlannerEnv
-from highlevel.task import load_task
+from highlevel.registry import load_task
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.control.controller import Controller, Proprioception
 from lowlevel.control.elevation_map import MAP_SIZE

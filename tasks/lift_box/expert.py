@@ -66,13 +66,14 @@ class LiftBoxExpert:
     """Scripted expert for the robots of one environment.
 
     Args:
-        environment: whose robots it controls.
-        task: that environment's task.
+        environment: of a :class:`tasks.lift_box.task.LiftBox`.
         config: how it moves.
     """
 
-    def __init__(self, environment: CommandEnvironment, task: LiftBox, config: ExpertConfig | None = None) -> None:
+    def __init__(self, environment: CommandEnvironment, config: ExpertConfig | None = None) -> None:
         self.config = ExpertConfig() if config is None else config
+        task = environment.task
+        assert isinstance(task, LiftBox)
         self._environment, self._task = environment, task
         self._period = environment.decision_period
         self._arms = ArmKinematics()
@@ -120,6 +121,7 @@ class LiftBoxExpert:
         height, pitch = self._posture()
         command[:, HEIGHT] = height
         command[:, TORSO.start + 1] = pitch
+        self._adapt(measured, situation)
         command[:, ARMS] = self._arm_targets(measured, situation)
         return self._environment.action_map.action(command)
 
@@ -223,22 +225,53 @@ class LiftBoxExpert:
 
     # -- arms ------------------------------------------------------------------------------------------------
 
-    def _arm_targets(self, measured: Measurement, situation: Situation) -> Tensor:
-        """Arm joints (N, 14) that put the palms where the phase wants them, given the torso as it is."""
-        config, memory, episode, robot = self.config, self._memory, self._task.episode, measured.robot
-        box = situation.box_pose
-        box_yaw = yaw_of(box[:, 3:])
+    def _adapt(self, measured: Measurement, situation: Situation) -> None:
+        """Move what the script integrates; :meth:`_wanted_palms` and :meth:`_arm_targets` only read it."""
+        config, memory, bottom = self.config, self._memory, self._task.episode.support_height
+        lifting, holding = memory.phase >= LIFT, memory.phase == HOLD
+
+        # The arms sink under a box that is held.
+        missing = config.carry_clearance - (situation.bottom - bottom)
+        memory.raised = (memory.raised + config.raise_gain * missing * holding).clamp(0.0, config.largest_raise)
+
+        # A box swings between the palms: the fingers turn against its pitch.
+        forward = self._forward(situation)
+        upright = rotate(situation.box_pose[:, 3:], torch.tensor([0.0, 0.0, 1.0]).expand_as(forward))
+        pitch = torch.atan2((upright * forward).sum(-1), upright[:, 2])
+        level = memory.level - config.level_gain * pitch * lifting
+        memory.level = level.clamp(-config.largest_level, config.largest_level)
+
+        gain = torch.where(lifting, config.pitch_filter, 1.0)
+        gain = torch.where(holding, config.hold_filter, gain)
+        error = situation.torso_pitch - self._posture()[1]
+        memory.pitch_error = memory.pitch_error + gain * (error - memory.pitch_error)
+
+        # Gravity and tracking keep the palms off their place beside the box.
+        arrived = (memory.phase == DESCEND) & (memory.descent >= 1.0)
+        error = self._wanted_palms(measured, situation, 0.0) - measured.robot.palm_position
+        limit = config.largest_correction
+        change = config.correction_gain * error * arrived[:, None, None]
+        memory.correction = (memory.correction + change).clamp(-limit, limit)
+
+    def _forward(self, situation: Situation) -> Tensor:
+        """Horizontal direction (N, 3) across the box, away from the robot; kept from the lift on."""
+        memory = self._memory
+        yaw = torch.where(memory.phase >= LIFT, memory.grasp_yaw, yaw_of(situation.box_pose[:, 3:]))
+        return torch.stack([torch.cos(yaw), torch.sin(yaw), torch.zeros_like(yaw)], -1)
+
+    def _wanted_palms(self, measured: Measurement, situation: Situation, thickness: float) -> Tensor:
+        """Where the phase wants the palms (N, 2, 3) [m], ``thickness`` [m] outside the surfaces that touch."""
+        config, memory, episode = self.config, self._memory, self._task.episode
         lifting = memory.phase >= LIFT
-        yaw = torch.where(lifting, memory.grasp_yaw, box_yaw)
-        forward = torch.stack([torch.cos(yaw), torch.sin(yaw), torch.zeros_like(yaw)], -1)
+        forward = self._forward(situation)
         left = torch.stack([-forward[:, 1], forward[:, 0], forward[:, 2]], -1)
 
-        at_box = box[:, :3] + config.palm_ahead * forward
+        at_box = situation.box_pose[:, :3] + config.palm_ahead * forward
         at_box[:, 2] = episode.support_height + episode.size[:, 2] - PALM_BELOW_TOP
-        feet = robot.foot_position.mean(dim=1)
+        feet = measured.robot.foot_position.mean(dim=1)
         carry = feet + (config.carry_ahead - SOLE_CENTER) * forward
         carry_height = episode.support_height + config.carry_clearance + episode.size[:, 2] - PALM_BELOW_TOP
-        carry[:, 2] = carry_height.clamp_min(config.carry_height) + self._raise_box(situation)
+        carry[:, 2] = carry_height.clamp_min(config.carry_height) + memory.raised
         # Up first, then back: the box must clear the knees.
         rise = _smooth(1.0 - memory.descent)
         back = _smooth((1.5 * (1.0 - memory.descent) - 0.5).clamp(0.0, 1.0))
@@ -249,30 +282,28 @@ class LiftBoxExpert:
         wide = config.wide * _smooth((4.0 * (1.0 - memory.descent)).clamp(0.0, 1.0)) * ~lifting
         apart = 0.5 * episode.size[:, 1] - memory.depth + wide
         side = torch.tensor([1.0, -1.0])
-        # The kinematic palm center lies inside the hand, behind the surface that touches.
-        offset = side[None, :, None] * (apart + PALM_HALF_THICKNESS)[:, None, None] * left[:, None]
-        target = middle[:, None] + offset
-        target = self._within_reach(target, measured)
-        error = middle[:, None] + side[None, :, None] * apart[:, None, None] * left[:, None] - robot.palm_position
-        self._correct(error)
+        return middle[:, None] + side[None, :, None] * (apart + thickness)[:, None, None] * left[:, None]
 
-        pelvis = self._pelvis_attitude(measured, situation)
-        pelvis_frame = pelvis[:, None].expand(-1, 2, -1)
-        position = rotate_inverse(pelvis_frame, target + memory.correction - robot.base_position[:, None])
-        self._level_box(situation, forward)
+    def _arm_targets(self, measured: Measurement, situation: Situation) -> Tensor:
+        """Arm joints (N, 14) that put the palms where the phase wants them, given the torso as it is."""
+        config, memory, robot = self.config, self._memory, measured.robot
+        # The kinematic palm center lies inside the hand, behind the surface that touches.
+        target = self._within_reach(self._wanted_palms(measured, situation, PALM_HALF_THICKNESS), measured)
+        pelvis = self._pelvis_attitude(measured)
+        both = pelvis[:, None].expand(-1, 2, -1)
+        position = rotate_inverse(both, target + memory.correction - robot.base_position[:, None])
         toe_in = config.toe_in + config.toe_in_per_depth * memory.depth.clamp_min(0.0)
-        axes = palm_rotation(forward, config.finger_pitch + memory.level, toe_in)
+        axes = palm_rotation(self._forward(situation), config.finger_pitch + memory.level, toe_in)
         columns = axes.transpose(-1, -2)
         in_pelvis = rotate_inverse(pelvis[:, None, None].expand(-1, 2, 3, -1), columns)
         rest = self._rest_posture(situation.torso_pitch)
         waist = robot.joint_position[:, WAIST_JOINTS]
         solution, _ = self._arms.inverse(waist, memory.arms, rest, position, in_pelvis.transpose(-1, -2))
-        at_work = memory.phase >= DESCEND
-        ready = self._neutral[ARMS].expand_as(solution)
-        memory.arms = torch.where(at_work[:, None], solution, self._rest_posture(situation.torso_pitch))
-        return torch.where(at_work[:, None], solution, ready)
+        at_work = (memory.phase >= DESCEND)[:, None]
+        memory.arms = torch.where(at_work, solution, rest)
+        return torch.where(at_work, solution, self._neutral[ARMS])
 
-    def _pelvis_attitude(self, measured: Measurement, situation: Situation) -> Tensor:
+    def _pelvis_attitude(self, measured: Measurement) -> Tensor:
         """Attitude of the pelvis (N, 4) that the arms reckon with.
 
         Before the grasp it is the measured one. With a box in the hands the arms must not follow every swing of
@@ -280,17 +311,12 @@ class LiftBoxExpert:
         filtered error.
         """
         memory, robot = self._memory, measured.robot
-        pitch = self._posture()[1]
-        lifting = memory.phase >= LIFT
-        error = situation.torso_pitch - pitch
-        gain = torch.where(lifting, self.config.pitch_filter, 1.0)
-        gain = torch.where(memory.phase == HOLD, self.config.hold_filter, gain)
-        memory.pitch_error = memory.pitch_error + gain * (error - memory.pitch_error)
-        zero = torch.zeros_like(pitch)
-        torso = from_roll_pitch_yaw(torch.stack([zero, pitch + memory.pitch_error, measured.heading], -1))
+        pitch = self._posture()[1] + memory.pitch_error
+        torso = from_roll_pitch_yaw(torch.stack([torch.zeros_like(pitch), pitch, measured.heading], -1))
         # The pelvis that carries the torso like this, with the waist joints as they are.
         waist = multiply(conjugate(robot.base_quaternion), robot.torso_quaternion)
-        return torch.where(lifting[:, None], multiply(torso, conjugate(waist)), robot.base_quaternion)
+        lifting = (memory.phase >= LIFT)[:, None]
+        return torch.where(lifting, multiply(torso, conjugate(waist)), robot.base_quaternion)
 
     def _rest_posture(self, torso_pitch: Tensor) -> Tensor:
         """Arms hanging ahead of the torso (N, 14), hands half open to the box."""
@@ -317,32 +343,6 @@ class LiftBoxExpert:
         share = (room / in_plane.clamp_min(1e-6)).clamp(max=1.0)
         offset = torch.stack([offset[..., 0] * share, offset[..., 1], offset[..., 2] * share], -1)
         return shoulder + rotate_about_vertical(measured.heading[:, None], offset)
-
-    def _correct(self, error: Tensor) -> None:
-        """Integrate the palms' position error (N, 2, 3) before the grasp; gravity and tracking cause it."""
-        config, memory = self.config, self._memory
-        active = (memory.phase == DESCEND) & (memory.descent >= 1.0)
-        limit = config.largest_correction
-        change = config.correction_gain * error * active[:, None, None]
-        memory.correction = (memory.correction + change).clamp(-limit, limit)
-
-    def _raise_box(self, situation: Situation) -> Tensor:
-        """Height (N,) [m] that makes up for how far the arms sink under a box that is held."""
-        config, memory = self.config, self._memory
-        missing = config.carry_clearance - (situation.bottom - self._task.episode.support_height)
-        change = config.raise_gain * missing * (memory.phase == HOLD)
-        memory.raised = (memory.raised + change).clamp(0.0, config.largest_raise)
-        return memory.raised
-
-    def _level_box(self, situation: Situation, forward: Tensor) -> None:
-        """Turn the fingers against the pitch of a box that is carried; it swings between the palms."""
-        config, memory = self.config, self._memory
-        up = torch.zeros_like(forward)
-        up[:, 2] = 1.0
-        upright = rotate(situation.box_pose[:, 3:], up)
-        pitch = torch.atan2((upright * forward).sum(-1), upright[:, 2])
-        change = config.level_gain * pitch * (memory.phase >= LIFT)
-        memory.level = (memory.level - change).clamp(-config.largest_level, config.largest_level)
 
 
 def _smooth(share: Tensor) -> Tensor:

@@ -195,8 +195,3 @@ class LiftBox(Task):
         shift = 0.5 * noise.position * (fresh[:, :3] + self.episode.position_bias)
         turn = 0.5 * noise.angle * (fresh[:, 3:] + self.episode.angle_bias)
         return shift, turn
-
-    def expert(self, environment: Any) -> Any:
-        from tasks.lift_box.expert import LiftBoxExpert
-
-        return LiftBoxExpert(environment, self)

@@ -7,25 +7,25 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from evaluation.demo import Arguments, Story, draw, main, outcome_text, run_episode
+from evaluation.demo import Arguments, EpisodeSummary, draw, main, outcome_text, run_episode
 
 
 def test_the_story_is_that_of_the_numbered_episode(
     untrained_controller: Path, tmp_path: Path, has_opengl: bool
 ) -> None:
-    stories: list[Story] = []
+    summaries: list[EpisodeSummary] = []
     for number in (0, 1):
         arguments = Arguments("scripted", seed=2, episode=number, threads=1)
-        story, twin = run_episode(arguments, untrained_controller, tmp_path / f"{len(stories)}.rrd")
-        stories.append(story)
-    assert not stories[0].success and stories[0].failure is not None
-    assert not np.array_equal(stories[0].instants["start"], stories[1].instants["start"])
-    assert next(iter(stories[1].instants)) == "start" and list(stories[1].instants)[-1] == "end"
+        summary, twin = run_episode(arguments, untrained_controller, tmp_path / f"{len(summaries)}.rrd")
+        summaries.append(summary)
+    assert not summaries[0].success and summaries[0].failure is not None
+    assert not np.array_equal(summaries[0].instants["start"], summaries[1].instants["start"])
+    assert next(iter(summaries[1].instants)) == "start" and list(summaries[1].instants)[-1] == "end"
     box = twin.model.geom("box").size
-    where = stories[1].instants["start"]
-    story = Story(False, "drop", 1.0, {"approach": 0.5}, {"start": where, "approach": where, "end": where})
+    where = summaries[1].instants["start"]
+    summary = EpisodeSummary(False, "drop", 1.0, {"approach": 0.5}, {"start": where, "approach": where, "end": where})
     names = ["stages.png", "0_start.png", "1_approach.png", "2_end.png"] if has_opengl else []
-    assert draw(twin, story, tmp_path) == names
+    assert draw(twin, summary, tmp_path) == names
     assert sorted(file.name for file in tmp_path.glob("*.png")) == sorted(names)
     assert ((box >= 0.125) & (box <= 0.175)).all() and len(set(box.tolist())) == 3, "the box has a drawn size"
 
@@ -50,10 +50,10 @@ def test_command_leaves_recording_report_and_outcome(
 
 
 def test_outcomes_in_words() -> None:
-    assert outcome_text(Story(True, None, 9.5, {"lift": 7.0}, {})) == "success after 9.5 s"
-    failed = Story(False, "drop", 8.0, {"approach": 3.0, "lift": 7.0}, {})
+    assert outcome_text(EpisodeSummary(True, None, 9.5, {"lift": 7.0}, {})) == "success after 9.5 s"
+    failed = EpisodeSummary(False, "drop", 8.0, {"approach": 3.0, "lift": 7.0}, {})
     assert outcome_text(failed) == "failure (drop) after 8.0 s, after the stage 'lift'"
-    assert "before the first stage" in outcome_text(Story(False, "fall", 1.0, {}, {}))
+    assert "before the first stage" in outcome_text(EpisodeSummary(False, "fall", 1.0, {}, {}))
 
 
 def test_bad_input_is_refused_in_one_sentence(untrained_controller: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from evaluation.highlevel import (
 )
 from evaluation.reporting.statistics import wilson_interval
 from highlevel.episodes import EpisodeRecord
-from highlevel.task import load_task
+from highlevel.registry import load_task
 
 STAGES = ("approach", "reach", "grasp", "lift", "upright", "hold")
 

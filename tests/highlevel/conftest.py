@@ -11,7 +11,7 @@ import torch
 from highlevel.environment import ROBOT_BLOCKS, CommandEnvironment, PhysicsConfig
 from highlevel.learning.config import PPOConfig
 from highlevel.learning.demonstrations import Source
-from highlevel.task import load_task
+from highlevel.registry import load_task
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from highlevel.environment import CommandEnvironment, PhysicsConfig, StepResult
-from highlevel.task import Decision, Outcome, load_task
+from highlevel.registry import load_task
+from highlevel.task import Decision, Outcome
 from lowlevel.commands import HEIGHT
 from lowlevel.control.controller import Controller
 from lowlevel.runs.checks import NonFiniteError

@@ -16,8 +16,7 @@ from evaluation import highlevel as evaluation
 from highlevel import train
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.planner import Planner
-from highlevel.registration import register_tasks
-from highlevel.task import environment_id, load_task, task_names
+from highlevel.registry import environment_id, load_task, register_tasks, task_names
 from highlevel.trainer import BEST_FOLDER
 
 

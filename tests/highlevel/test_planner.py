@@ -17,8 +17,7 @@ from highlevel.action import ActionConfig
 from highlevel.environment import CommandEnvironment
 from highlevel.learning.policy import PlannerActor, PlannerNetwork, policy_arguments
 from highlevel.planner import PLANNER_FILE, WEIGHTS_FILE, Planner, PlannerConfig, PlannerError, planner_hash
-from highlevel.registration import DEFAULT_CONTROLLER, find_controller
-from highlevel.task import load_task
+from highlevel.registry import DEFAULT_CONTROLLER, find_controller, load_task
 from highlevel.vec_env import PlannerVecEnv
 from lowlevel.control.controller import content_hash
 from robots.errors import PilotError

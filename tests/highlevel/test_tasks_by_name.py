@@ -9,7 +9,8 @@ import gymnasium
 import pytest
 
 import highlevel
-from highlevel.task import Task, environment_id, load_task, task_names
+from highlevel.registry import environment_id, load_task, task_names
+from highlevel.task import Task
 
 
 def test_every_task_folder_loads_and_is_registered() -> None:

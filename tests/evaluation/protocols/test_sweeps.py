@@ -10,7 +10,8 @@ import torch
 
 from evaluation.protocols.sweeps import cells, report_lines, sweep_figures, sweep_result, write_plots
 from highlevel.episodes import EpisodeRecord
-from highlevel.task import Sweep, SweepAxis, Task, load_task
+from highlevel.registry import load_task
+from highlevel.task import Sweep, SweepAxis, Task
 from tasks.lift_box.config import LiftBoxConfig, SpawnConfig
 from tasks.lift_box.episode import draw
 from tasks.lift_box.sweeps import SWEEPS

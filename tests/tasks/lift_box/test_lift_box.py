@@ -15,6 +15,7 @@ from robots.g1.constants import HAND_BODIES
 from robots.rotations import yaw_of
 from tasks.lift_box.config import LiftBoxConfig, NoiseConfig, PushConfig, SpawnConfig
 from tasks.lift_box.episode import draw
+from tasks.lift_box.expert import LiftBoxExpert
 from tasks.lift_box.geometry import relative_pose
 from tasks.lift_box.scene import BOX, FORCE_SENSORS, HAND_GEOMS, SUPPORT
 from tasks.lift_box.task import LiftBox
@@ -249,7 +250,7 @@ def test_the_expert_walks_to_the_box_first(make: Make) -> None:
     environment = make(6)
     environment.reset(seed=0)
     task = _lift_box(environment)
-    expert = task.expert(environment)
+    expert = LiftBoxExpert(environment)
     action = expert.act(environment.observe())
     command = environment.action_map.command(action)
     assert environment.measured is not None

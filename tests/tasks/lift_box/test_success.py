@@ -9,8 +9,7 @@ import pytest
 from evaluation.protocols.policies import SCRIPTED, make_policy
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.episodes import run_episodes
-from highlevel.registration import find_controller
-from highlevel.task import load_task
+from highlevel.registry import find_controller, load_task
 
 EPISODES = 8
 SHIPPED = Path(__file__).resolve().parents[3] / "checkpoints" / "highlevel" / "lift-box"

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from highlevel.action import ActionConfig
+from highlevel.environment import CommandEnvironment
 from highlevel.task import Decision, ObservationBlock, Outcome, Start, Task
 from lowlevel.commands import HEIGHT
 from lowlevel.runs.draws import uniform
@@ -65,15 +66,13 @@ class Squat(Task):
     def failures(self, fallen: Tensor) -> list[str]:
         return ["fall" if fell else "too_high" for fell in fallen.tolist()]
 
-    def expert(self, environment: Any) -> Any:
-        return SquatExpert(environment, self)
-
 
 class SquatExpert:
     """Commands the wanted height and nothing else."""
 
-    def __init__(self, environment: Any, task: Squat) -> None:
-        self._environment, self._task = environment, task
+    def __init__(self, environment: CommandEnvironment) -> None:
+        assert isinstance(environment.task, Squat)
+        self._environment, self._task = environment, environment.task
 
     def act(self, observation: Tensor) -> Tensor:
         command = self._environment.controller.config.command_space.neutral().repeat(len(observation), 1)
@@ -84,4 +83,4 @@ class SquatExpert:
         """It remembers nothing."""
 
 
-TASK = Squat
+TASK, EXPERT = Squat, SquatExpert
