@@ -262,17 +262,13 @@ class CommandEnvironment:
             raise RuntimeError("call reset() before observe()")
         robot = measured.robot
         time_left = 1.0 - self.decisions / self.max_decisions
-        observation = torch.cat(
-            [
-                self.task.observe_object(measured),
-                robot.base_angular_velocity,
-                measured.projected_gravity,
-                robot.joint_position - self._default,
-                robot.joint_velocity,
-                self.action_map.normalize(self.command),
-                self.task.observe_additions(measured, time_left),
-            ],
-            dim=-1,
-        )
+        seen = self.task.observe(measured, time_left) | {
+            "base_angular_velocity": robot.base_angular_velocity,
+            "projected_gravity": measured.projected_gravity,
+            "joint_position": robot.joint_position - self._default,
+            "joint_velocity": robot.joint_velocity,
+            "previous_command": self.action_map.normalize(self.command),
+        }
+        observation = torch.cat([seen[block.name] for block in self.blocks], dim=-1)
         require_finite("observation", observation)
         return observation

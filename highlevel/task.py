@@ -132,13 +132,11 @@ class Task(ABC):
         """Judge one control step."""
 
     @abstractmethod
-    def observe_object(self, measured: Measurement) -> Tensor:
-        """The :attr:`object_blocks` (N, ...) of the observation, in the pelvis frame."""
+    def observe(self, measured: Measurement, time_left: Tensor) -> dict[str, Tensor]:
+        """What is seen of each of the :attr:`object_blocks`, in the pelvis frame, and the :attr:`added_blocks`.
 
-    @abstractmethod
-    def observe_additions(self, measured: Measurement, time_left: Tensor) -> Tensor:
-        """The :attr:`added_blocks` (N, ...) of the observation; ``time_left`` (N,) is a share of the
-        episode."""
+        ``time_left`` (N,) is a share of the episode. Each value is (N, size of its block), in physical units.
+        """
 
     @property
     @abstractmethod

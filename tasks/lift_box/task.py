@@ -160,25 +160,21 @@ class LiftBox(Task):
 
     # -- observation -----------------------------------------------------------------------------------------
 
-    def observe_object(self, measured: Measurement) -> Tensor:
-        robot = measured.robot
+    def observe(self, measured: Measurement, time_left: Tensor) -> dict[str, Tensor]:
+        robot, box = measured.robot, self._observed_box(measured)
         pelvis = torch.cat([robot.base_position, robot.base_quaternion], -1)
-        position, quaternion = relative_pose(pelvis, self._observed_box(measured))
-        return torch.cat([position, rotation_6d(quaternion)], -1)
-
-    def observe_additions(self, measured: Measurement, time_left: Tensor) -> Tensor:
-        current = self.progress.stage.clamp(max=len(STAGES) - 1)
-        return torch.cat(
-            [
-                self.episode.size,
-                self._look_at(measured, self._observed_box(measured)).palm_offset.flatten(1),
-                self.progress.touching.float(),
-                torch.nn.functional.one_hot(current, len(STAGES)).float(),
-                time_left[:, None],
-                self.progress.best_potential[:, None],
-            ],
-            dim=-1,
-        )
+        position, quaternion = relative_pose(pelvis, box)
+        stage = self.progress.stage.clamp(max=len(STAGES) - 1)
+        return {
+            "box_position": position,
+            "box_rotation": rotation_6d(quaternion),
+            "box_size": self.episode.size,
+            "palm_to_face": self._look_at(measured, box).palm_offset.flatten(1),
+            "palm_contact": self.progress.touching.float(),
+            "stage": torch.nn.functional.one_hot(stage, len(STAGES)).float(),
+            "time_left": time_left[:, None],
+            "best_potential": self.progress.best_potential[:, None],
+        }
 
     def _observed_box(self, measured: Measurement) -> Tensor:
         """World pose (N, 7) at which the robot sees the box: off by the noise, in the axes of its pelvis."""

@@ -88,10 +88,20 @@ def test_environments_that_are_given_one_controller_do_not_disturb_each_other(
 def test_what_is_not_finite_is_refused(make_environment: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     environment = make_environment()
     environment.reset(seed=0)
-    spoilt = torch.tensor([[0.0], [math.nan]]).expand(2, 9)
-    monkeypatch.setattr(environment.task, "observe_object", lambda measured: spoilt)
+    seen = environment.task.observe
+    spoilt = {"box_position": torch.tensor([[0.0], [math.nan]]).expand(2, 3)}
+    monkeypatch.setattr(environment.task, "observe", lambda *arguments: seen(*arguments) | spoilt)
     with pytest.raises(NonFiniteError, match="observation is not finite in 1 of 2 rows: 1"):
         environment.observe()
+
+
+def test_every_block_is_as_wide_as_it_says(make_environment: Make) -> None:
+    environment = make_environment()
+    environment.reset(seed=0)
+    seen = environment.task.observe(environment.measured, torch.ones(2))
+    blocks = (*environment.task.object_blocks, *environment.task.added_blocks)
+    assert {name: tuple(value.shape) for name, value in seen.items()} == {b.name: (2, b.size) for b in blocks}
+    assert environment.observe().shape == (2, environment.observation_size)
 
 
 def test_the_observed_previous_command_is_the_limited_and_feasible_one(make_environment: Make) -> None:

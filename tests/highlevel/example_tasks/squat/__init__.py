@@ -53,11 +53,8 @@ class Squat(Task):
         self.reached = error < TOLERANCE
         return Outcome(reward=-error, success=self.reached, failure=torch.zeros_like(self.reached))
 
-    def observe_object(self, measured: Measurement) -> Tensor:
-        return torch.zeros(len(self.wanted), 0)
-
-    def observe_additions(self, measured: Measurement, time_left: Tensor) -> Tensor:
-        return self.wanted[:, None]
+    def observe(self, measured: Measurement, time_left: Tensor) -> dict[str, Tensor]:
+        return {"wanted_height": self.wanted[:, None]}
 
     @property
     def stage(self) -> Tensor:
