@@ -34,9 +34,8 @@ from evaluation.reporting.reports import (
     METRICS_FILE,
     REPORT_FILE,
     check_output,
-    format_figure,
-    markdown_table,
     metrics,
+    render,
     write_metrics,
     write_results,
 )
@@ -206,25 +205,7 @@ _ROWS = {
 
 def report_text(figures: dict[str, Figure], machine: dict[str, Any], arguments: Arguments) -> str:
     """``report.md``."""
-    rows: list[list[str]] = []
-    for name, meaning in _ROWS.items():
-        figure = figures[name]
-        digits = 0 if (figure.value or 0.0) >= 100.0 else 2
-        unit = "" if figure.unit == "1" else figure.unit
-        rows.append([meaning, format_figure(figure, digits), unit, name])
-    return "\n".join(
-        [
-            "# Speed",
-            "",
-            f"{machine['processor']}, {arguments.cores} of {machine['cores_present']} cores; "
-            f"{arguments.robots} robots, planner {arguments.planner_robots} robots. Rates are means of "
-            f"{WINDOWS} windows of {arguments.seconds / WINDOWS:g} s, training's of {arguments.updates} updates; "
-            "intervals are bootstrapped over these, which for so few is hardly more than their range. Steps are "
-            "control steps: one robot advanced by 0.02 s. A decision is five of them.",
-            "",
-            markdown_table(["quantity", "value", "unit", "figure"], rows),
-        ]
-    )
+    return render("speed", machine=machine, arguments=arguments, windows=WINDOWS, rows=_ROWS, figures=figures)
 
 
 if __name__ == "__main__":

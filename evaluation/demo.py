@@ -19,7 +19,7 @@ from evaluation.protocols.policies import SCRIPTED, controller_for, make_policy
 from evaluation.reporting.reports import (
     REPORT_FILE,
     check_output,
-    markdown_table,
+    render,
     write_json,
     write_results,
 )
@@ -220,17 +220,15 @@ def outcome_text(summary: EpisodeSummary) -> str:
 
 def report_text(arguments: Arguments, summary: EpisodeSummary, controller: Path, pictures: list[str]) -> str:
     """``report.md``."""
-    made_by = identities(arguments, controller)
-    stages = [[stage, f"{seconds:.2f}"] for stage, seconds in summary.stage_times.items()]
-    lines = [
-        f"# {arguments.task.replace('_', ' ').capitalize()}: {outcome_text(summary)}",
-        "",
-        f"Planner `{made_by['planner']}` on controller `{made_by['controller']}`, seed {arguments.seed}, "
-        f"episode {arguments.episode}. Recording: `{RECORDING_FILE}`, open it with `rerun {RECORDING_FILE}`.",
-        "",
-        markdown_table(["stage passed", "time [s]"], stages) if stages else "No stage was passed.\n",
-    ]
-    return "\n".join([*lines, *(f"![{name}]({name})" for name in pictures), ""])
+    return render(
+        "demo",
+        task=arguments.task.replace("_", " ").capitalize(),
+        outcome=outcome_text(summary),
+        made_by=identities(arguments, controller),
+        recording=RECORDING_FILE,
+        stage_times=summary.stage_times,
+        pictures=pictures,
+    )
 
 
 if __name__ == "__main__":

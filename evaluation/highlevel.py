@@ -15,7 +15,7 @@ import tyro
 
 from evaluation.protocols.parallel import Run, Setting, run_all
 from evaluation.protocols.policies import SCRIPTED, controller_for
-from evaluation.protocols.sweeps import SweepResult, cells, report_lines, sweep_figures, sweep_result, write_plots
+from evaluation.protocols.sweeps import SweepResult, cells, sweep_figures, sweep_result, write_plots
 from evaluation.reporting.plots import plot_bars
 from evaluation.reporting.reports import (
     METRICS_FILE,
@@ -24,6 +24,7 @@ from evaluation.reporting.reports import (
     format_figure,
     markdown_table,
     metrics,
+    render,
     write_json,
     write_metrics,
     write_results,
@@ -255,72 +256,43 @@ def summary(evaluation: Evaluation) -> str:
     return "  ".join([*parts, f"over {len(evaluation.records)} episodes"])
 
 
+HEADLINE = {
+    "full success": "full",
+    "lift-up": "lift_up",
+    "falls": "fall_rate",
+    "time to success [s]": "success_time",
+}
+"""Label of the report to figure."""
+
+
 def report_text(evaluation: Evaluation, figures: dict[str, Figure]) -> str:
     """``report.md``."""
-    arguments, count = evaluation.arguments, len(evaluation.records)
-    planner = f"Planner `{evaluation.planner}`" if evaluation.planner else "Scripted expert"
-    headline = {
-        "full success": "full",
-        "lift-up": "lift_up",
-        "falls": "fall_rate",
-        "time to success [s]": "success_time",
-    }
-    lines = [
-        f"# {arguments.task.replace('_', ' ').capitalize()}",
-        "",
-        f"{planner} on controller `{evaluation.controller}`, {count} episodes, seed {arguments.seed}. Shares "
-        "with 95 % Wilson intervals. Full success is the whole task, lift-up only its lifting stage.",
-        "",
-        markdown_table(
-            ["figure", "value"],
-            [[label, format_figure(figures[name])] for label, name in headline.items() if name in figures],
-        ),
-        "## Stages",
-        "",
-        markdown_table(
-            ["passed", "share of episodes"],
-            [[stage, format_figure(figures[f"stage_{stage}"])] for stage in evaluation.stages],
-        ),
-        "![stages](stages.png)",
-        "",
-        "## Failures",
-        "",
-        *_failure_section(evaluation),
-    ]
-    if evaluation.controls:
-        lines += [
-            "## Negative controls",
-            "",
-            "These must never succeed.",
-            "",
-            _control_table(evaluation, figures),
-        ]
-    if evaluation.sweeps:
-        lines += report_lines(evaluation.sweeps)
-    return "\n".join(lines)
-
-
-def _failure_section(evaluation: Evaluation) -> list[str]:
-    failures = failure_figures(evaluation.records)
-    if not failures:
-        return ["None.", ""]
-    rows = []
-    for name, figure in failures.items():
-        numbers = [str(record.number) for record in evaluation.records if record.failure == name]
-        shown = ", ".join(numbers[:8]) + (", …" if len(numbers) > 8 else "")
-        rows.append([name.replace("_", " "), str(len(numbers)), format_figure(figure), shown])
     failed = [record for record in evaluation.records if record.failure is not None]
-    return [
-        markdown_table(["failure", "count", "share of episodes", "episode numbers"], rows),
-        "The first of them, with when they passed each stage. Recorded by `run-demo` with the same planner, task and "
-        f"`--seed {evaluation.arguments.seed} --episode NUMBER`, one may end otherwise: it is simulated alone there.",
-        "",
-        _failed_episodes(failed[:SHOWN_FAILURES], evaluation.stages),
-    ]
+    failures = {
+        name: (figure, [record.number for record in failed if record.failure == name])
+        for name, figure in failure_figures(evaluation.records).items()
+    }
+    return render(
+        "success",
+        task=evaluation.arguments.task.replace("_", " ").capitalize(),
+        seed=evaluation.arguments.seed,
+        planner=evaluation.planner,
+        controller=evaluation.controller,
+        count=len(evaluation.records),
+        headline=HEADLINE,
+        stages=evaluation.stages,
+        figures=figures,
+        failures=failures,
+        failed_episodes=_failed_episodes(failed[:SHOWN_FAILURES], evaluation.stages),
+        controls={name: sum(record.success for record in records) for name, records in evaluation.controls.items()},
+        sweeps=evaluation.sweeps,
+    )
 
 
 def _failed_episodes(failed: list[EpisodeRecord], stages: tuple[str, ...]) -> str:
     """A table with a line per failed episode: what it was like, and how far it came."""
+    if not failed:
+        return ""
     conditions = list(failed[0].conditions)
     rows = []
     for record in failed:
@@ -330,16 +302,6 @@ def _failed_episodes(failed: list[EpisodeRecord], stages: tuple[str, ...]) -> st
         cause = str(record.failure).replace("_", " ")
         rows.append([str(record.number), *what, *times, f"{cause} at {record.duration:.1f}"])
     return markdown_table(["episode", *conditions, *(f"{stage} [s]" for stage in stages), "end [s]"], rows)
-
-
-def _control_table(evaluation: Evaluation, figures: dict[str, Figure]) -> str:
-    rows = []
-    for control, records in evaluation.controls.items():
-        succeeded = sum(record.success for record in records)
-        verdict = "as it must be" if succeeded == 0 else f"**{succeeded} succeeded: the success criterion is wrong**"
-        full = figures[f"full_{control}"]
-        rows.append([control.replace("_", " "), str(len(records)), format_figure(full), verdict])
-    return markdown_table(["control", "episodes", "full success", "verdict"], rows)
 
 
 if __name__ == "__main__":

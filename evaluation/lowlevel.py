@@ -13,20 +13,15 @@ import numpy as np
 import torch
 import tyro
 
+from evaluation.protocols import tracking
 from evaluation.protocols.arena import BATCH, Arena, batch_steps
+from evaluation.protocols.skills import BARS, FLAT, SKILLS, UNLOADED_BEND, run_skills, skill_episodes
 from evaluation.protocols.skills import EPISODES as SKILL_EPISODES
-from evaluation.protocols.skills import FLAT, SKILLS, run_skills, skill_episodes, skills_section
 from evaluation.protocols.tracking import (
-    AVERAGING,
-    COMMAND_INTERVAL,
-    EPISODE_LENGTH,
     FIGURES,
     GROUPS,
     SUITES,
-    TRANSIENT,
     WALK_EPISODES,
-    WALK_SPEED,
-    WALK_TIME,
     CommandTable,
     conditions_of,
     mode_episodes,
@@ -48,6 +43,7 @@ from evaluation.reporting.reports import (
     format_figure,
     markdown_table,
     metrics,
+    render,
     write_metrics,
     write_results,
 )
@@ -289,95 +285,30 @@ def summary(evaluation: Evaluation) -> str:
 
 def report_text(evaluation: Evaluation) -> str:
     """``report.md``."""
-    figures = evaluation.figures
-    survival, speed = figures["walk_half_mps_survival"], figures["walk_half_mps_speed"]
-    energy, action_rate = figures["energy_per_meter"], figures["action_rate"]
-    episodes = figures["fall_rate"].n
-    return "\n".join(
-        [
-            f"# Tracking on the {evaluation.suite} suite",
-            "",
-            f"Controller `{evaluation.controller}`, {episodes} episodes of {EPISODE_LENGTH:.0f} s with a new "
-            f"command every {COMMAND_INTERVAL:.0f} s, seed {evaluation.seed}, terrain "
-            f"{', '.join(evaluation.tiles)}, condition {evaluation.condition}. Means over episodes with 95 % bootstrap "
-            f"intervals over episodes (Wilson intervals for shares). Steady errors leave out the first {TRANSIENT:.0f} "
-            "s after a change of command. A command that ends in a fall counts in full at the error it had until then, "
-            "and the next one begins from standing. E_v_mean and E_omega_mean are the errors of velocities averaged "
-            f"over {AVERAGING:g} s: drift without the sway of the gait. E_arm is that of commands with I = 1. Every "
-            f"command by itself stands in `{EPISODES_FILE}`.",
-            "",
-            markdown_table(
-                ["figure", "unit", "ours", "ours, steady", "paper, blind"], _main_rows(figures, evaluation.suite)
-            ),
-            "![tracking](tracking.png)",
-            "",
-            f"Traveling costs {format_figure(energy, 0)} J per meter: the sum of |torque times joint speed| over all "
-            "steps whose command asks for translation, by the way made good in the commanded direction. From one "
-            f"control step to the next a joint's target moves by {format_figure(action_rate, 4)} rad on average.",
-            "",
-            *_comparison(evaluation.differences),
-            "## By kind of command",
-            "",
-            "Walk and work: full velocity range with moderate postures and moving arms. Stand and work: full "
-            "height, torso and arm ranges. Walk only: full velocity range, neutral posture (I = 0).",
-            "",
-            _breakdown(figures, {group: f"_{group}" for group in GROUPS}),
-            "Steady:",
-            "",
-            _breakdown(figures, {group: f"_{group}" for group in GROUPS}, "_steady"),
-            "![transient](transient.png)",
-            "",
-            "## By terrain",
-            "",
-            _breakdown(figures, {tile: f"_on_{tile}" for tile in evaluation.tiles}),
-            "## Walking",
-            "",
-            f"Commanded to walk at {WALK_SPEED} m/s for {WALK_TIME:.0f} s, a share of "
-            f"{format_figure(survival)} of {survival.n} episodes does not fall; the mean forward speed is "
-            f"{format_figure(speed)} m/s. A share of {format_figure(figures['walk_half_mps_success'])} "
-            "neither falls nor stays below half the commanded speed.",
-            "",
-            *([skills_section(figures)] if "deep_bend_success" in figures else []),
-            "## Experts",
-            "",
-            "Mean activation of each expert in six motion modes, after the transient; blank where no robot stayed up.",
-            "",
-            "![experts](experts.png)",
-            "",
-        ]
+    figures, groups = evaluation.figures, {group: f"_{group}" for group in GROUPS}
+    has_skills = "deep_bend_success" in figures
+    return render(
+        "tracking",
+        **{name: getattr(evaluation, name) for name in ("suite", "condition", "seed", "controller", "tiles")},
+        protocol=tracking,
+        figures=figures,
+        paper=PAPER[evaluation.suite],
+        differences=_comparison(evaluation.differences),
+        by_group=_breakdown(figures, groups),
+        by_group_steady=_breakdown(figures, groups, "_steady"),
+        by_tile=_breakdown(figures, {tile: f"_on_{tile}" for tile in evaluation.tiles}),
+        skills=[skill for skill in SKILLS if skill is not UNLOADED_BEND] if has_skills else [],
+        bars=BARS,
     )
 
 
-def _main_rows(figures: Mapping[str, Figure], suite: str) -> list[list[str]]:
-    paper = PAPER[suite]
-    rows = [
-        [
-            name,
-            unit,
-            format_figure(figures[name]),
-            format_figure(figures[f"{name}_steady"]),
-            f"{paper[name]:.3f}" if name in paper else "–",
-        ]
-        for name, unit in FIGURES.items()
-    ]
-    rates = ("fall_rate", "fall_rate_command", "non_finite_rate")
-    return rows + [[name, "1", format_figure(figures[name]), "–", "–"] for name in rates]
-
-
-def _comparison(differences: Mapping[str, Mapping[str, Figure]]) -> list[str]:
-    """The section on other controllers, if there are any."""
+def _comparison(differences: Mapping[str, Mapping[str, Figure]]) -> str:
+    """The table of other controllers; empty without any."""
     if not differences:
-        return []
+        return ""
     names = list(next(iter(differences.values())))
     rows = [[name, *(format_figure(figures[name]) for figures in differences.values())] for name in names]
-    return [
-        "## Against other controllers",
-        "",
-        "Ours minus theirs, episode by episode with the same commands, starts, friction and noise; below zero we are "
-        "better. fell is the share of commands that end in a fall.",
-        "",
-        markdown_table(["figure", *(f"against `{name}`" for name in differences)], rows),
-    ]
+    return markdown_table(["figure", *(f"against `{name}`" for name in differences)], rows)
 
 
 def _breakdown(figures: Mapping[str, Figure], columns: Mapping[str, str], suffix: str = "") -> str:

@@ -15,7 +15,6 @@ import torch
 from evaluation.protocols.arena import Arena, Episode, HandLoad, Push, episode_seeds
 from evaluation.protocols.trace import Channel, Trace, record, time_mean
 from evaluation.protocols.tracking import TILE_SIZE
-from evaluation.reporting.reports import format_figure, markdown_table
 from evaluation.reporting.statistics import Figure, mean_figure, share_figure
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY, CommandSpace
 from lowlevel.world.measures import height_error, torso_error
@@ -290,25 +289,3 @@ BARS: dict[str, Bar | None] = {
     "push_success": Bar(0.9),
 }
 """Rows of the report's table and the bar of each."""
-
-
-def skills_section(figures: Mapping[str, Figure]) -> str:
-    """The section "Skills" of ``report.md``."""
-    rows = []
-    for name, bar in BARS.items():
-        figure = figures[name]
-        verdict = ["–", "–"] if bar is None else [str(bar), "yes" if bar.is_met(figure) else "no"]
-        rows.append([name, figure.unit, format_figure(figure), str(figure.n), *verdict])
-    return "\n".join(
-        [
-            "## Skills",
-            "",
-            f"{figures['deep_bend_success'].n} episodes each from standing on flat ground, with the friction and the "
-            "observation noise above. Means are over the episodes that reach the time in question, up to the fall of "
-            "one that falls; drift and turn are those of the episodes that stay up.",
-            "",
-            *(f"- {skill.name}: {skill.description}" for skill in SKILLS if skill is not UNLOADED_BEND),
-            "",
-            markdown_table(["figure", "unit", "ours", "episodes", "bar", "met"], rows),
-        ]
-    )

@@ -33,6 +33,26 @@ class SweepResult:
         columns = self.sweep.columns
         return ["full success"] if columns is None else [f"{value:g}" for value in columns.values]
 
+    @property
+    def axes(self) -> str:
+        """What is varied, in words."""
+        sweep = self.sweep
+        return sweep.rows.label if sweep.columns is None else f"{sweep.rows.label} and {sweep.columns.label}"
+
+    @property
+    def table(self) -> str:
+        """Of all cells, in Markdown."""
+        rows = [
+            [label, *(format_figure(figure) for figure in row)]
+            for label, row in zip(self.row_labels, self.cells, strict=True)
+        ]
+        return markdown_table([self.sweep.rows.label, *self.column_labels], rows)
+
+    @property
+    def picture(self) -> str:
+        """Name of the file of its heat map."""
+        return f"sweep_{self.sweep.name}.png"
+
 
 def cells(task: Task, sweep: Sweep) -> Iterator[Task]:
     """Fresh copies of ``task``, one per cell, row by row."""
@@ -71,7 +91,7 @@ def write_plots(folder: Path, results: list[SweepResult]) -> None:
         values = np.array([[100.0 * (figure.value or 0.0) for figure in row] for row in result.cells])
         columns = result.sweep.columns
         plot_heat_map(
-            folder / _picture(result),
+            folder / result.picture,
             values,
             result.row_labels,
             result.column_labels,
@@ -81,31 +101,3 @@ def write_plots(folder: Path, results: list[SweepResult]) -> None:
             axes=(result.sweep.rows.label, "" if columns is None else columns.label),
             colors="YlGn",
         )
-
-
-def report_lines(results: list[SweepResult]) -> list[str]:
-    """Section of the report."""
-    count = results[0].cells[0][0].n
-    note = f"Full success over {count} episodes a cell, the same ones in every cell but for what it fixes."
-    lines = ["## Sweeps", "", note, ""]
-    for result in results:
-        rows = [
-            [label, *(format_figure(figure) for figure in row)]
-            for label, row in zip(result.row_labels, result.cells, strict=True)
-        ]
-        lines += [
-            f"### {_axes(result.sweep).capitalize()}",
-            "",
-            markdown_table([result.sweep.rows.label, *result.column_labels], rows),
-            f"![{result.sweep.name}]({_picture(result)})",
-            "",
-        ]
-    return lines
-
-
-def _axes(sweep: Sweep) -> str:
-    return sweep.rows.label if sweep.columns is None else f"{sweep.rows.label} and {sweep.columns.label}"
-
-
-def _picture(result: SweepResult) -> str:
-    return f"sweep_{result.sweep.name}.png"

@@ -11,11 +11,22 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import jinja2
+
 from evaluation.reporting.statistics import Figure
 from lowlevel.runs.run_folder import git_revision
 from robots.errors import PilotError
 
 METRICS_FILE, REPORT_FILE = "metrics.json", "report.md"
+
+_TEMPLATES = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+    autoescape=False,
+)
 
 
 def check_output(folder: Path) -> None:
@@ -80,6 +91,11 @@ def markdown_table(header: list[str], rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in [header, rule, *rows]) + "\n"
 
 
+def render(template: str, **values: Any) -> str:
+    """Markdown from ``templates/<template>.md.j2``, in which figures can be filtered by ``figure`` (with digits)."""
+    return _TEMPLATES.get_template(f"{template}.md.j2").render(**values)
+
+
 def format_figure(figure: Figure, digits: int = 3) -> str:
     """Value and interval, such as ``0.145 [0.140, 0.151]``."""
     if figure.value is None:
@@ -88,3 +104,6 @@ def format_figure(figure: Figure, digits: int = 3) -> str:
     if figure.ci95 is not None:
         text += f" [{figure.ci95[0]:.{digits}f}, {figure.ci95[1]:.{digits}f}]"
     return text
+
+
+_TEMPLATES.filters["figure"] = format_figure

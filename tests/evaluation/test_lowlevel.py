@@ -280,8 +280,10 @@ def test_command_writes_a_report(
     assert difference["E_v"]["value"] == 0.0
     rows = (output / "episodes.csv").read_text().splitlines()
     assert len(rows) == 1 + 2 * 2 and rows[0].startswith("episode,tile,group,E_v,")
-    assert "## Skills" in (output / "report.md").read_text()
-    assert "0.145" in (output / "report.md").read_text(), "the paper's figure stands beside ours"
+    text = (output / "report.md").read_text()
+    assert "## Skills" in text and "- deep_bend: bend to height" in text and "unloaded_bend" not in text
+    assert "| push_success | 1 |" in text and "| ≥ 0.90 |" in text
+    assert "0.145" in text, "the paper's figure stands beside ours"
     assert str(output / "report.md") in capsys.readouterr().out
     stored = json.loads((folder / "controller.json").read_text())["provenance"]["metrics"]
     assert stored["simple"]["figures"]["E_v"] == content["figures"]["E_v"]

@@ -31,7 +31,6 @@ from evaluation.protocols.skills import (
     palms_in_torso,
     skill_episodes,
     skill_figures,
-    skills_section,
 )
 from evaluation.protocols.trace import Trace, record
 from evaluation.reporting.statistics import mean_figure
@@ -212,13 +211,6 @@ def test_figures_of_scripted_traces() -> None:
     assert values["stop_drift"] == pytest.approx(0.25 * 0.32 * 500 / 799, rel=1e-6)
     assert values["stop_turn"] == pytest.approx(0.05)
     assert all(figure.ci95 is not None for figure in figures.values())
-
-    section = skills_section(figures)
-    assert section.startswith("## Skills") and "4 episodes each" in section and "unloaded_bend" not in section
-    assert "| deep_bend_success | 1 | 0.500 [0.150, 0.850] | 4 | ≥ 1.00 | no |" in section
-    assert "| push_success | 1 | 1.000 [0.510, 1.000] | 4 | ≥ 0.90 | yes |" in section
-    assert "| loaded_walk_speed | m/s | 0.400 [0.400, 0.400] | 4 | – | – |" in section
-    assert all(f"| {name} |" in section for name in figures)
 
 
 def test_a_bar_is_met_by_reaching_it() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from evaluation.protocols.sweeps import cells, report_lines, sweep_figures, sweep_result, write_plots
+from evaluation.protocols.sweeps import cells, sweep_figures, sweep_result, write_plots
 from highlevel.episodes import EpisodeRecord
 from highlevel.registry import load_task
 from highlevel.task import Sweep, SweepAxis, Task
@@ -58,8 +58,7 @@ def test_results_are_tabled_and_drawn(tmp_path: Path) -> None:
         "full_mass_edge_1_0.25",
     }
     assert len(figures) == 12 and all(figure.n == 4 for figure in figures.values())
-    text = "\n".join(report_lines([result]))
-    assert "over 4 episodes" in text and "| mass [kg] | 0.25 | 0.3 | 0.35 |" in text
+    assert result.table.startswith("| mass [kg] | 0.25 | 0.3 | 0.35 |")
     write_plots(tmp_path, [result])
     assert (tmp_path / "sweep_mass_edge.png").stat().st_size > 1000
 
