@@ -31,6 +31,7 @@ from lowlevel.control.observation import (
     start_history,
 )
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
+from lowlevel.control.stepping import swing_first
 from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
 from lowlevel.privileged import PRIVILEGED, PrivilegedView
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
@@ -108,8 +109,8 @@ class StepResult:
     """The clamped command that the step tracked (N, 21)."""
     kind: Tensor
     """Number of its kind in KINDS (N,)."""
-    commanded: Tensor
-    """Whether another command follows it (N,), one that neither policy nor critic could foresee."""
+    surprised: Tensor
+    """Whether a new command or a push follows (N,), which neither policy nor critic could foresee."""
 
 
 class PilotEnvironment:
@@ -208,6 +209,8 @@ class PilotEnvironment:
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
         command, kind = buffers.command, buffers.kind.clone()
+        # The frozen controller goes by the policy's estimate of this velocity.
+        buffers.reference = self.reference.begin_step(buffers.reference, swing_first(measured.linear_velocity))
         next_privileged = build(PRIVILEGED, self._view(measured, ground))
 
         done, now = torch.nonzero(fallen | truncated)[:, 0], measured
@@ -216,8 +219,8 @@ class PilotEnvironment:
             fresh = self.world.measure(done)
             now = with_rows(measured, done, fresh)
             ground = ground.index_copy(0, done, self._seen_ground(fresh))
-        buffers.hand_force = self.randomizer.disturb(now.robot, now.heading)
-        commanded = self._resample_due_commands()
+        buffers.hand_force, pushed = self.randomizer.disturb(now.robot, now.heading)
+        surprised = self._resample_due_commands() | pushed
         self._advance_reference()
         self._step_count += 1
         return StepResult(
@@ -230,7 +233,7 @@ class PilotEnvironment:
             measured=measured,
             command=command,
             kind=kind,
-            commanded=commanded,
+            surprised=surprised,
         )
 
     def set_command(self, ids: Tensor, command: Tensor, flag: Tensor) -> None:

@@ -45,9 +45,17 @@ STEPPING = replace(TRACKING, foot_phase=2.0, foot_placement=2.0, contact_schedul
 """While it improves its steps: shaping that has done its work makes a fall cost more, and speed cost falls."""
 
 GENTLE = RandomizationConfig(
-    friction=(0.6, 1.2), hand_load_probability=0.0, push_velocity=0.15, delay=(0.7, 0.3, 0.0), waist_effort=(50.0, 50.0)
+    friction=(0.6, 1.2),
+    hand_load_probability=0.0,
+    start_velocity=0.1,
+    push_velocity=0.15,
+    delay=(0.7, 0.3, 0.0),
+    waist_effort=(50.0, 50.0),
 )
-"""For a robot that still learns to walk."""
+"""For a robot that still learns to walk, and cannot catch itself by a step when it is pushed at a stand."""
+
+FIRM = replace(GENTLE, push_velocity=0.4)
+"""For one that can catch itself by a step."""
 
 EVERYTHING = (
     ("steer", 0.15),
@@ -124,7 +132,7 @@ STAGES = (
         std=(0.05, 0.1),
         mixture=(("steer", 0.3), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.5)),
         rewards=STEPPING,
-        randomization=GENTLE,
+        randomization=FIRM,
     ),
     Stage(
         "walk and work",
@@ -135,7 +143,7 @@ STAGES = (
         rollout_doublings=1,
         mixture=(("steer", 0.2), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.2), ("walk_and_work", 0.4)),
         rewards=STEPPING,
-        randomization=GENTLE,
+        randomization=FIRM,
     ),
     Stage(
         "harden",

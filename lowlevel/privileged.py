@@ -10,10 +10,7 @@ from lowlevel.control.elevation_map import MAP_MIRROR
 from lowlevel.control.observation import FRAME, FRAME_MIRROR, HISTORY_LENGTH, Block, FrameView
 from lowlevel.world.measures import Measurement, height_error, torso_error
 from lowlevel.world.randomization import RandomizationState
-from robots.g1.mirror import AXIAL_VECTOR, JOINTS_MIRROR, VECTOR, Mirror, concatenate, signs
-
-_PAIR = Mirror(signs(1, 1).index[::-1].copy(), signs(1, 1).sign)
-_PAIR_OF_VECTORS = Mirror(concatenate(VECTOR, VECTOR).index[[3, 4, 5, 0, 1, 2]], concatenate(VECTOR, VECTOR).sign)
+from robots.g1.mirror import AXIAL_VECTOR, JOINTS_MIRROR, PAIR, PAIR_OF_VECTORS, VECTOR, Mirror, concatenate, signs
 
 
 @dataclass(frozen=True)
@@ -38,12 +35,12 @@ PRIVILEGED: tuple[Block[PrivilegedView], ...] = (
     Block("base_height_error", signs(1), lambda v: height_error(v.measured, v.command)[:, None]),
     Block("torso_error", AXIAL_VECTOR, lambda v: torso_error(v.measured, v.command)),
     Block("mean_velocity_error", signs(1, -1, -1), lambda v: v.mean_velocity_error),
-    Block("foot_contact", _PAIR, lambda v: v.measured.foot_contact.float(), normalized=False),
-    Block("foot_clearance", _PAIR, lambda v: v.measured.foot_clearance),
-    Block("foot_position", _PAIR_OF_VECTORS, lambda v: v.measured.foot_position.flatten(1)),
-    Block("foot_velocity", _PAIR_OF_VECTORS, lambda v: v.measured.foot_velocity.flatten(1)),
-    Block("foot_force", _PAIR_OF_VECTORS, lambda v: v.measured.foot_force.flatten(1) / 400.0),
-    Block("hand_force", _PAIR_OF_VECTORS, lambda v: v.hand_force.flatten(1) / 20.0),
+    Block("foot_contact", PAIR, lambda v: v.measured.foot_contact.float(), normalized=False),
+    Block("foot_clearance", PAIR, lambda v: v.measured.foot_clearance),
+    Block("foot_position", PAIR_OF_VECTORS, lambda v: v.measured.foot_position.flatten(1)),
+    Block("foot_velocity", PAIR_OF_VECTORS, lambda v: v.measured.foot_velocity.flatten(1)),
+    Block("foot_force", PAIR_OF_VECTORS, lambda v: v.measured.foot_force.flatten(1) / 400.0),
+    Block("hand_force", PAIR_OF_VECTORS, lambda v: v.hand_force.flatten(1) / 20.0),
     Block("friction", signs(1), lambda v: v.drawn.friction),
     Block("added_mass", signs(1, 1), lambda v: v.drawn.added_mass),
     Block("flag", signs(1), lambda v: v.flag, normalized=False),

@@ -13,7 +13,7 @@ import tyro
 from torch import Tensor
 
 from lowlevel.absorption import AbsorptionConfig, absorb_prior
-from lowlevel.commands import shares
+from lowlevel.commands import KINDS, shares
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import (
     FRAME,
@@ -109,6 +109,7 @@ class Trainer:
             command_columns=~normalized_columns(FRAME),
             privileged_command_columns=~normalized_columns(PRIVILEGED),
             gait_clock=columns(FRAME, "gait_clock"),
+            tasks=len(KINDS),
             seed=config.seed,
         )
         self.steps = 0
@@ -204,9 +205,9 @@ class Trainer:
         for _ in range(self.ppo.storage.steps):
             action = self.ppo.act(self.observation)
             result = self.environment.step(action.cpu())
-            # A new command changes what the future is worth, and no action is to blame for it.
-            interrupted = result.truncated | result.commanded
-            self.ppo.record(result.reward, result.terminated, interrupted, result.next_privileged)
+            # New commands and pushes change what the future is worth, and no action is to blame for it.
+            interrupted = result.truncated | result.surprised
+            self.ppo.record(result.reward, result.terminated, interrupted, result.next_privileged, result.kind)
             self.observation = result.observation
             self.curriculum.observe(result.kind, result.terms, result.terminated)
             terms.add(result.terms | {"total": result.reward / self.environment.control_period})

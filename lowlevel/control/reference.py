@@ -1,8 +1,8 @@
 """What the action is a residual on: the slewed command, the gait clock, and the joint targets that they give.
 
 The paper adds the policy's arm output to the commanded arm joints (III-B-2). Here legs and waist do the same around
-the nominal-pose table, an addition to the paper. Nothing here reads a sensor, and no gait is built: how the robot
-steps is the policy's. The training environment and the frozen controller share this module.
+the nominal-pose table, an addition to the paper. No gait is built: how the robot steps is the policy's. The training
+environment and the frozen controller share this module.
 """
 
 from __future__ import annotations
@@ -121,15 +121,26 @@ class Reference:
         walking = (state.phase + self._phase_step) % (2.0 * math.pi)
         return ReferenceState(slewed, torch.where(walks, walking, self._stopping(state.phase)))
 
+    def begin_step(self, state: ReferenceState, swing_first: Tensor) -> ReferenceState:
+        """Let robots at rest make two steps, unless their posture is too deep to walk in.
+
+        ``swing_first`` (N,): the foot to begin with, 1 left, -1 right, 0 for no step.
+        """
+        steps = (swing_first != 0.0) & ~state.walking & self._can_walk(state.command)[:, 0]
+        beginning = torch.where(swing_first > 0.0, 0.0, math.pi) + self._phase_step
+        return state._replace(phase=torch.where(steps, beginning, state.phase))
+
+    def _can_walk(self, command: Tensor) -> Tensor:
+        """Whether robots walk in the posture of ``command`` (N, 21), as (N, 1)."""
+        posture = command[:, POSTURE]
+        return (posture - posture.clamp(self._lowest, self._highest)).abs().amax(dim=1, keepdim=True) < 1e-3
+
     def _goal(self, state: ReferenceState, command: Tensor) -> Tensor:
         """What ``state`` may head for by now (N, 21): deep postures wait for the last step, velocity for posture."""
-        posture = state.command[:, POSTURE]
-        upright = posture.clamp(self._lowest, self._highest)
-        ready = (posture - upright).abs().amax(dim=1, keepdim=True) < 1e-3
         moves = state.walking[:, None] | is_walking(command)[:, None]
         wanted = command[:, POSTURE]
         within = torch.where(moves, wanted.clamp(self._lowest, self._highest), wanted)
-        return torch.cat([command[:, VELOCITY] * ready, within, command[:, ARMS]], dim=1)
+        return torch.cat([command[:, VELOCITY] * self._can_walk(state.command), within, command[:, ARMS]], dim=1)
 
     def _stopping(self, phase: Tensor) -> Tensor:
         """The next phase (N,) of robots that stop: from (0, pi) on to 4 pi, from (pi, 2 pi) on to 7 pi, then 0."""

@@ -16,11 +16,11 @@ from torch import Tensor
 from torch.distributions import kl_divergence
 
 from lowlevel.learning.learner import ACTOR_KEYS, POLICY_KEYS, Learner, PPOConfig
-from lowlevel.learning.rollout import RolloutStorage, generalized_advantages
+from lowlevel.learning.rollout import RolloutStorage, generalized_advantages, normalized_by_task
 from lowlevel.learning.symmetry import TensorMirrors
 from lowlevel.networks.actor import VELOCITY_SIZE, NetworkConfig, ObservationSizes
 from lowlevel.runs.checks import NonFiniteError, require_finite
-from lowlevel.runs.distributed import rank, sum_over_ranks, world_size
+from lowlevel.runs.distributed import rank
 from robots.errors import PilotError
 from robots.g1.mirror import Mirror
 
@@ -48,6 +48,7 @@ class PPO:
         command_columns: Tensor,
         privileged_command_columns: Tensor | None = None,
         gait_clock: slice | None = None,
+        tasks: int = 1,
         seed: int = 0,
     ) -> None:
         """Build networks, optimizers and storage.
@@ -56,7 +57,9 @@ class PPO:
         bool marks the frame columns that already have a fixed scale and are not normalized, commands above all;
         ``privileged_command_columns`` (P,) bool does the same for the critic and also hides these columns
         from the next-state encoder. ``gait_clock``: the columns of a frame with its sine and cosine, for noise that
-        repeats with the gait; without it all noise is white. Ranks draw different noise from the same ``seed``.
+        repeats with the gait; without it all noise is white. ``tasks``: advantages are normalized within each of as
+        many, see :func:`lowlevel.learning.rollout.normalized_by_task`. Ranks draw different noise from the same
+        ``seed``.
 
         Raises:
             PilotError: if sizes do not fit together.
@@ -88,6 +91,7 @@ class PPO:
         shapes |= dict.fromkeys(("log_prob", "reward", "advantage", "returns"), ())
         self._shapes = shapes
         self.gait_clock = gait_clock
+        self.tasks = tasks
         self._gait_noise = torch.zeros(num_envs, sizes.action, 3, device=self.device)
         """Constant, sine and cosine part of each robot's pattern."""
         self.storage = self._room_for(config.steps_per_update, num_envs)
@@ -180,12 +184,19 @@ class PPO:
         """Mean actions (N, A), without noise; nothing is stored."""
         return self.learner.policy({key: observation[key].to(self.device) for key in ACTOR_KEYS}).mean
 
-    def record(self, reward: Tensor, terminated: Tensor, truncated: Tensor, next_privileged: Tensor) -> None:
+    def record(
+        self,
+        reward: Tensor,
+        terminated: Tensor,
+        truncated: Tensor,
+        next_privileged: Tensor,
+        task: Tensor | None = None,
+    ) -> None:
         """Store what followed the last :meth:`act`.
 
         ``reward`` (N,); ``terminated`` (N,) bool, the episode ended in failure; ``truncated`` (N,) bool, it
         ran out of time, or what follows has nothing to do with the action; ``next_privileged`` (N, P) as it was
-        *before* any reset.
+        *before* any reset; ``task`` (N,) long, below ``tasks``, all the same by default.
 
         Raises:
             NonFiniteError: if a reward or a privileged observation is not finite.
@@ -194,7 +205,8 @@ class PPO:
         require_finite(f"reward {where}", reward)
         require_finite(f"next privileged observation {where}", next_privileged)
         self.storage.write({"reward": reward.to(self.device), "next_privileged": next_privileged.to(self.device)})
-        self.storage.finish_step(terminated.to(self.device), truncated.to(self.device))
+        task = torch.zeros_like(terminated, dtype=torch.long) if task is None else task
+        self.storage.finish_step(terminated.to(self.device), truncated.to(self.device), task.to(self.device))
 
     def update(self, observation_after: Mapping[str, Tensor]) -> dict[str, float]:
         """Learn from the full rollout and return what happened, as means over the gradient steps.
@@ -257,11 +269,9 @@ class PPO:
         )
         storage.data["returns"].copy_(advantages + values)
         explained = 1.0 - float(advantages.var() / storage.data["returns"].var().clamp(min=1e-8))
-        count = advantages.numel() * world_size()
-        mean = sum_over_ranks(advantages.sum()) / count
-        variance = sum_over_ranks((advantages - mean).square().sum()) / count
         limit = self.config.advantage_limit
-        storage.data["advantage"].copy_(((advantages - mean) / (variance.sqrt() + 1e-8)).clamp(-limit, limit))
+        normalized = normalized_by_task(advantages, storage.task, self.tasks)
+        storage.data["advantage"].copy_(normalized.clamp(-limit, limit))
         return explained
 
     def _update_normalizers(self) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lowlevel.runs.distributed import sum_over_ranks
+
 
 def generalized_advantages(
     rewards: Tensor,
@@ -31,6 +33,23 @@ def generalized_advantages(
     return advantages
 
 
+def normalized_by_task(advantages: Tensor, task: Tensor, tasks: int) -> Tensor:
+    """``advantages`` (T, N) with mean 0 and deviation 1 within each ``task`` (T, N), over all ranks.
+
+    A task in which robots fall has advantages ten times as large as one that they master: over both together, what
+    would still improve the second is lost in the noise of the first.
+    """
+
+    def totals(values: Tensor) -> Tensor:
+        total = torch.zeros(tasks, dtype=values.dtype, device=values.device)
+        return sum_over_ranks(total.index_add(0, task.flatten(), values.flatten()))
+
+    count = totals(torch.ones_like(advantages)).clamp_min(1.0)
+    centered = advantages - (totals(advantages) / count)[task]
+    deviation = (totals(centered.square()) / count).sqrt()
+    return centered / (deviation[task] + 1e-8)
+
+
 class RolloutStorage:
     """Preallocated tensors of one rollout, filled step by step and reused.
 
@@ -46,6 +65,7 @@ class RolloutStorage:
         self.data = {name: torch.zeros(steps, num_envs, *shape, device=device) for name, shape in shapes.items()}
         self.terminated = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
+        self.task = torch.zeros(steps, num_envs, dtype=torch.long, device=device)
 
     @property
     def full(self) -> bool:
@@ -65,8 +85,8 @@ class RolloutStorage:
                 raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(slot.shape)}")
             slot.copy_(value)
 
-    def finish_step(self, terminated: Tensor, truncated: Tensor) -> None:
-        """Record how the current step ended, (N,) bool each, and move on to the next.
+    def finish_step(self, terminated: Tensor, truncated: Tensor, task: Tensor) -> None:
+        """Record how the current step ended, (N,) bool each, and its ``task`` (N,) long, and move on to the next.
 
         Raises:
             ValueError: if the rollout is full.
@@ -74,6 +94,7 @@ class RolloutStorage:
         self._require_room()
         self.terminated[self.position] = terminated
         self.truncated[self.position] = truncated
+        self.task[self.position] = task
         self.position += 1
 
     def flat(self, name: str) -> Tensor:

@@ -47,7 +47,7 @@ class RandomizationConfig:
     """Force on each hand towards the other one [N]; negative pushes outwards, as a squeezed box does."""
     start_velocity: float = 0.2
     """Largest velocity of the base at the start of an episode, per axis [m/s]."""
-    push_velocity: float = 0.3
+    push_velocity: float = 0.8
     """Largest horizontal velocity change of a push, per axis [m/s]."""
     push_interval: tuple[float, float] = (4.0, 8.0)
     """Time between pushes [s]."""
@@ -181,10 +181,15 @@ class Randomizer:
         self.simulation.per_robot("body_ipos")[cells] = self._nominal_center + moved
         self.simulation.update_constants(ids)
 
-    def disturb(self, robot: RobotState, heading: Tensor) -> Tensor:
-        """Apply hand loads and due pushes for the next step; returns hand forces (N, 2, 3) [N], heading frame."""
+    def disturb(self, robot: RobotState, heading: Tensor) -> tuple[Tensor, Tensor]:
+        """Apply hand loads and due pushes for the next step.
+
+        Returns:
+            hand forces (N, 2, 3) [N], heading frame, and which robots were pushed (N,).
+        """
         state, config = self.state, self.config
         force = torch.zeros(len(heading), 2, 3, device=heading.device)
+        pushed = torch.zeros(len(heading), dtype=torch.bool, device=heading.device)
         if config.hand_load_probability > 0.0:
             across = robot.palm_position[:, 1] - robot.palm_position[:, 0]
             inwards = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-3)
@@ -199,7 +204,8 @@ class Randomizer:
                 change = self._uniform(-config.push_velocity, config.push_velocity, len(due), 3)
                 change[:, 2] = 0.0
                 self.simulation.push(change * due[:, None])
+                pushed = due
                 state.push_countdown = torch.where(
                     due, self._uniform(*config.push_interval, len(due)), state.push_countdown
                 )
-        return rotate_about_vertical(-heading[:, None], force)
+        return rotate_about_vertical(-heading[:, None], force), pushed

@@ -17,7 +17,8 @@ from robots.errors import PilotError
 from robots.g1.constants import WAIST_JOINTS
 from robots.g1.model import ModelOptions, build_spec
 from robots.g1.nominal_pose import NominalPose
-from robots.rotations import about_axis, conjugate, from_roll_pitch_yaw, multiply
+from robots.g1.waist import pelvis_attitude
+from robots.rotations import about_axis, multiply
 
 CLEARANCE = 0.005
 """Height of the soles above the ground when a robot is stood up [m]."""
@@ -115,13 +116,3 @@ class World:
     def elevation(self, measured: Measurement) -> Tensor:
         """The elevation map (n, 121): vertical distance base - terrain [m], without noise."""
         return self.terrain.elevation_map(measured.robot.base_position, measured.heading)
-
-
-def pelvis_attitude(torso: Tensor, waist: Tensor) -> Tensor:
-    """Pelvis quaternion (N, 4) in the heading frame that puts the torso at ``torso`` (N, 3; roll, pitch, yaw).
-
-    ``waist`` (N, 3): waist joints in the order of the joint table, yaw, roll, pitch [rad].
-    """
-    yaw, roll, pitch = waist.unbind(-1)
-    tilted = multiply(about_axis(0, roll), about_axis(1, pitch))
-    return multiply(from_roll_pitch_yaw(torso), conjugate(multiply(about_axis(2, yaw), tilted)))

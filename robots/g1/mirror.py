@@ -44,6 +44,10 @@ VECTOR = signs(1, -1, 1)
 """Polar vectors: positions, linear velocities, forces, gravity."""
 AXIAL_VECTOR = signs(-1, 1, -1)
 """Axial vectors: angular velocities, torques."""
+PAIR = Mirror(np.array([1, 0]), np.ones(2))
+"""One number for the left and one for the right."""
+PAIR_OF_VECTORS = Mirror(np.array([3, 4, 5, 0, 1, 2]), np.tile(VECTOR.sign, 2))
+"""A polar vector for the left and one for the right."""
 
 
 def concatenate(*mirrors: Mirror) -> Mirror:

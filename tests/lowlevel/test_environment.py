@@ -1,7 +1,9 @@
 """The environment: finite, deterministic, honest about time limits, mirrored, and equal to the frozen controller."""
 
 import inspect
+import math
 from dataclasses import fields, replace
+from pathlib import Path
 
 import mujoco
 import pytest
@@ -27,6 +29,7 @@ from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.measures import TRACKING_FIGURES
 from lowlevel.world.randomization import RandomizationConfig
 from lowlevel.world.terrain import TerrainConfig
+from robots.rotations import rotate_about_vertical
 
 SMALL = EnvironmentConfig(num_robots=6, num_threads=1)
 QUIET = replace(
@@ -179,8 +182,37 @@ def test_a_step_says_whether_another_command_follows() -> None:
         result = environment.step(torch.zeros(64, 29))
         assert torch.equal(result.command, before)
         changed = (environment.buffers.command != before).any(dim=1)
-        assert torch.equal(result.commanded, changed)
-    assert result.commanded.any() and not result.commanded.all()
+        assert torch.equal(result.surprised, changed)
+    assert result.surprised.any() and not result.surprised.all()
+
+
+def test_a_step_says_whether_a_push_follows() -> None:
+    pushes = replace(QUIET.randomization, push_velocity=0.5, push_interval=(0.04, 0.1))
+    environment = PilotEnvironment(replace(QUIET, num_robots=16, command_interval=(9.0, 9.1), randomization=pushes))
+    environment.reset()
+    surprised = torch.zeros(16, dtype=torch.bool)
+    for _ in range(5):
+        result = environment.step(torch.zeros(16, 29))
+        # The velocity that was measured at the end of the step, against the one that the next step begins with
+        jump = (environment.simulation.read().base_linear_velocity - result.measured.robot.base_linear_velocity).norm(
+            dim=1
+        )
+        assert torch.equal(result.surprised, jump > 1e-3)
+        surprised |= result.surprised
+    assert surprised.all()
+
+
+def test_a_standing_robot_that_is_pushed_steps() -> None:
+    environment = PilotEnvironment(replace(QUIET, command_interval=(9.0, 9.1), mixture=(("stand", 1.0),)))
+    environment.reset()
+    assert not environment.buffers.reference.walking.any()
+    push = torch.tensor([[0.1, 0, 0], [0.6, 0, 0], [-0.6, 0, 0], [0, 0.6, 0], [0, -0.6, 0], [0, 0, 0]])
+    turned = rotate_about_vertical(environment.world.measure().heading, push)
+    environment.simulation.push(turned)
+    environment.step(torch.zeros(6, 29))
+    walking, clock = environment.buffers.reference.walking, environment.buffers.reference.clock
+    assert walking.tolist() == [False, True, True, True, True, False]
+    assert clock[3, 0] < 0.0 < clock[4, 0], "pushed to the left it swings the right foot, and the other way round"
 
 
 def test_robots_start_just_above_the_ground_as_fast_as_configured() -> None:
@@ -254,8 +286,10 @@ def test_every_reward_weight_has_a_term_and_every_term_a_weight() -> None:
     assert {field.name for field in fields(RewardWeights)} == set(REWARD_TERMS) == terms
 
 
-def test_frozen_controller_repeats_the_training_policy(tmp_path) -> None:
+def test_frozen_controller_repeats_the_training_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Controller.act on noise-free measurements gives the targets that the environment applies."""
+    # An untrained policy's estimate of its velocity says nothing about when to step.
+    monkeypatch.setattr("lowlevel.control.stepping.LARGEST_SPEED", math.inf)
     stage = Stage(arms_act=True, randomization=QUIET.randomization)
     config = TrainingConfig(environment=QUIET, ppo=PPOConfig(steps_per_update=8, minibatches=2), stages=(stage,))
     trainer = Trainer(config, tmp_path)

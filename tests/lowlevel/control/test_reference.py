@@ -10,10 +10,10 @@ import torch
 from lowlevel.commands import ARMS, HEIGHT, POSTURE, TORSO, VELOCITY, CommandSpace, command_space
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
-from lowlevel.world.world import pelvis_attitude
 from robots.g1.constants import GAINS, NUM_JOINTS, WAIST_JOINTS, joint_index
 from robots.g1.mirror import JOINTS_MIRROR
 from robots.g1.model import build_spec, joint_limits
+from robots.g1.waist import pelvis_attitude
 
 CONFIG = ReferenceConfig()
 

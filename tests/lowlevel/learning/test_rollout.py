@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lowlevel.learning.rollout import RolloutStorage, generalized_advantages
+from lowlevel.learning.rollout import RolloutStorage, generalized_advantages, normalized_by_task
 
 
 def _row(*values: float) -> torch.Tensor:
@@ -48,10 +48,13 @@ def test_storage_keeps_steps_in_order() -> None:
     storage = RolloutStorage(2, 3, {"x": (2,), "reward": ()}, torch.device("cpu"))
     for step in range(2):
         storage.write({"x": torch.full((3, 2), float(step)), "reward": torch.arange(3.0) + 10 * step})
-        storage.finish_step(torch.tensor([False, True, False]), torch.zeros(3, dtype=torch.bool))
+        storage.finish_step(
+            torch.tensor([False, True, False]), torch.zeros(3, dtype=torch.bool), torch.tensor([4, 0, 2])
+        )
     assert storage.full
     assert storage.flat("reward").tolist() == [0, 1, 2, 10, 11, 12]
     assert storage.data["reward"].tolist() == [[0, 1, 2], [10, 11, 12]]
+    assert storage.task.tolist() == [[4, 0, 2]] * 2
     assert storage.terminated.tolist() == [[False, True, False]] * 2
 
 
@@ -60,8 +63,17 @@ def test_storage_refuses_wrong_shapes_and_overflow() -> None:
     with pytest.raises(ValueError, match=r"x has shape \(3, 4\), expected \(3, 2\)"):
         storage.write({"x": torch.zeros(3, 4)})
     never = torch.zeros(3, dtype=torch.bool)
-    storage.finish_step(never, never)
+    storage.finish_step(never, never, never.long())
     with pytest.raises(ValueError, match="already holds its 1 steps"):
         storage.write({"x": torch.zeros(3, 2)})
     storage.clear()
     storage.write({"x": torch.zeros(3, 2)})
+
+
+def test_advantages_are_normalized_within_each_task() -> None:
+    task = torch.tensor([[0, 2, 0, 2], [0, 2, 0, 0]])
+    advantages = torch.tensor([[1.0, 100.0, 3.0, 300.0], [1.0, 200.0, 3.0, 2.0]])
+    values = normalized_by_task(advantages, task, tasks=3)
+    one, hundred = 5**0.5 / 2, 1.5**0.5  # deviations 0.8**0.5 and 100 * (2 / 3)**0.5
+    expected = torch.tensor([[-one, -hundred, one, hundred], [-one, 0.0, one, 0.0]])
+    torch.testing.assert_close(values, expected)
