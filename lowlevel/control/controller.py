@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import onnx
 import torch
-from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidArgument, InvalidGraph, InvalidProtobuf
+from google.protobuf.message import DecodeError
 from torch import Tensor
 
 from lowlevel.commands import CommandSpace, clamp_posture
@@ -322,8 +323,10 @@ def _read_onnx(folder: Path, device: torch.device | str) -> OnnxStep:
     if not path.is_file():
         raise ControllerError(f"{path} is missing: copy the whole controller folder")
     try:
+        # ONNX Runtime's own errors are private to it.
+        onnx.checker.check_model(onnx.load(path))
         return OnnxStep(path)
-    except (Fail, InvalidArgument, InvalidGraph, InvalidProtobuf) as error:
+    except (DecodeError, onnx.checker.ValidationError) as error:
         raise ControllerError(f"{path} is damaged or truncated: {error}") from error
     except (KeyError, ValueError) as error:
         raise ControllerError(f"{path} does not say what its first memory is: export the controller again") from error
