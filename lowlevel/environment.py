@@ -33,9 +33,9 @@ from lowlevel.control.observation import (
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.control.stepping import swing_first
 from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
-from lowlevel.privileged import PRIVILEGED, PrivilegedView
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
 from lowlevel.world.measures import Measurement, is_lost, velocity_error, with_rows
+from lowlevel.world.privileged import PRIVILEGED, PrivilegedView
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
 from lowlevel.world.terrain import TerrainConfig
 from lowlevel.world.world import World

@@ -27,13 +27,13 @@ from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
 from lowlevel.gait_prior import first_stride
 from lowlevel.learning.ppo import PPO, PPOConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes
-from lowlevel.privileged import MIRRORS, PRIVILEGED, PRIVILEGED_SIZE
 from lowlevel.runs.distributed import any_rank, average_over_ranks, rank, world_size
 from lowlevel.runs.interrupts import stop_on_signals
 from lowlevel.runs.progress import ProgressReport
 from lowlevel.runs.run_folder import RunFolder
 from lowlevel.stages import Stage
 from lowlevel.world.measures import TRACKING_FIGURES
+from lowlevel.world.privileged import MIRRORS, PRIVILEGED, PRIVILEGED_SIZE
 from robots.errors import PilotError
 from robots.g1.constants import LOWER_JOINTS, NUM_JOINTS
 

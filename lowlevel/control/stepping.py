@@ -1,7 +1,7 @@
 """When a robot that is told to stand must step.
 
 Feet that stay where they are hold a push of some 0.3 m/s. A robot that is pushed harder must step, and its policy knows
-how to; but its gait clock rests. The clock runs for two steps when the pelvis moves faster than any posture asks for.
+how to; but its gait clock rests. The clock runs for two steps when the pelvis moves fast.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 LARGEST_SPEED = 0.25
-"""Horizontal speed of the pelvis at which a robot steps [m/s]; the quickest bends reach 0.3 m/s for a moment."""
+"""Horizontal speed of the pelvis at which a robot steps [m/s]. At rest 99.9 % of the steps are slower, while it
+bends 90 %."""
 
 
 def swing_first(velocity: Tensor) -> Tensor:

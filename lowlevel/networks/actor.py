@@ -237,9 +237,9 @@ class TargetEncoder(nn.Module):
         self.prototypes = nn.Parameter(functional.normalize(prototypes, dim=1))
         self.register_buffer("visible", 1.0 - hidden.float())
 
-    def forward(self, normalised_privileged: Tensor) -> Tensor:
+    def forward(self, normalized_privileged: Tensor) -> Tensor:
         """Normalized next privileged observation (N, seen) to a unit latent (N, latent)."""
-        return functional.normalize(self.layers(normalised_privileged * self.visible), dim=1)
+        return functional.normalize(self.layers(normalized_privileged * self.visible), dim=1)
 
     @torch.no_grad()
     def renormalize_prototypes(self) -> None:

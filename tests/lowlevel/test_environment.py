@@ -11,7 +11,7 @@ import torch
 
 from lowlevel import rewards
 from lowlevel.commands import HEIGHT, KINDS
-from lowlevel.control.controller import Controller, Proprioception
+from lowlevel.control.controller import Controller
 from lowlevel.control.observation import (
     FRAME,
     FRAME_SIZE,
@@ -22,11 +22,11 @@ from lowlevel.control.observation import (
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 from lowlevel.export import export_controller
 from lowlevel.learning.ppo import PPOConfig
-from lowlevel.privileged import MIRRORS, PRIVILEGED_SIZE
 from lowlevel.rewards import REWARD_TERMS, RewardWeights
 from lowlevel.stages import Stage
 from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.measures import TRACKING_FIGURES
+from lowlevel.world.privileged import MIRRORS, PRIVILEGED_SIZE
 from lowlevel.world.randomization import RandomizationConfig
 from lowlevel.world.terrain import TerrainConfig
 from robots.rotations import rotate_about_vertical
@@ -302,15 +302,8 @@ def test_frozen_controller_repeats_the_training_policy(tmp_path: Path, monkeypat
     environment = trainer.environment
     observation = environment.reset()
     for _ in range(25):
-        measured = environment.world.measure()
-        robot = measured.robot
         targets = controller.act(
-            Proprioception(
-                robot.joint_position,
-                robot.joint_velocity,
-                robot.base_angular_velocity,
-                measured.projected_gravity,
-            ),
+            environment.world.measure().proprioception,
             environment.buffers.elevation + 0.75,
             environment.buffers.command,
             environment.buffers.flag,
