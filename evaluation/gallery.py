@@ -95,7 +95,7 @@ def draw(controller: Controller, seed: int) -> np.ndarray:
         PilotError: if the robot falls in one of them.
     """
     arena = Arena(controller, TerrainConfig(tiles=("irregular",)), batch=len(POSES))
-    neutral = controller.config.command_space.neutral()
+    neutral = controller.command_space.neutral()
     episodes = [constant(seed, DURATION, _command(pose, neutral), flag=1.0) for pose in POSES]
     for moment in arena.run(episodes):
         down = moment.fell | moment.failed

@@ -170,7 +170,7 @@ def evaluate(
     """Run the protocol, the walking test, the motion modes and the skill tests, and the protocol with ``others``."""
     began = time.monotonic()
     terrain = suite_terrain(arguments.suite)
-    space, tiles, seed = controller.config.command_space, len(terrain.tiles), arguments.seed
+    space, tiles, seed = controller.command_space, len(terrain.tiles), arguments.seed
     conditions = conditions_of(arguments.condition)
 
     def arena_of(tested: Controller, tiles: TerrainConfig) -> Arena:
@@ -225,7 +225,7 @@ def _record(controller: Controller, arguments: Arguments, folder: Path) -> None:
     terrain = suite_terrain(arguments.suite)
     conditions = conditions_of(arguments.condition)
     arena = Arena(controller, terrain, conditions, num_threads=arguments.threads, batch=arguments.robots)
-    space = controller.config.command_space
+    space = controller.command_space
     episodes = protocol_episodes(space, arguments.record, arguments.seed, len(terrain.tiles))
     record_episodes(arena, episodes, folder)
 

@@ -129,7 +129,7 @@ class CommandEnvironment:
         self.seed = seed
         self.episode = rows(num_envs)
         self.decisions = torch.zeros(num_envs, dtype=torch.long)
-        self.command = self.controller.config.command_space.neutral().repeat(num_envs, 1)
+        self.command = self.controller.command_space.neutral().repeat(num_envs, 1)
         """Limited command (N, 21) that the last decision ended with."""
         self.measured: Measurement | None = None
         """Measurement after the last control step, after resets."""
@@ -157,7 +157,7 @@ class CommandEnvironment:
 
     def _begin(self, ids: Tensor) -> None:
         """Start the current episode number of robots ``ids`` (n,)."""
-        neutral = self.controller.config.command_space.neutral().repeat(len(ids), 1)
+        neutral = self.controller.command_space.neutral().repeat(len(ids), 1)
         self.simulation.restart(ids)
         start = self.task.reset(ids, self.seed, self.episode[ids])
         self.world.stand(ids, start.position, start.heading, neutral)

@@ -192,7 +192,7 @@ class EpisodeRecording:
 def record_episodes(arena: Arena, episodes: Sequence[Episode], folder: Path) -> list[Path]:
     """Run a batch of low-level episodes and write one file for each; a repeated episode goes as before."""
     twin = VisualTwin(arena.world.terrain.add_to)
-    experts = arena.controller.experts
+    experts = arena.experts
     paths = [folder / f"episode_{number}.rrd" for number in range(len(episodes))]
     with ExitStack() as stack:
         films = [EpisodeRecording(stack.enter_context(Recorder(path)), twin, experts) for path in paths]

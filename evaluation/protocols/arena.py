@@ -1,4 +1,4 @@
-"""Runs a frozen controller through scripted episodes and hands out every control step.
+"""Runs any controller through scripted episodes and hands out every control step.
 
 An episode is fixed by its seed and its command schedule alone. Friction, start and observation noise come
 from the episode's own generator, and every batch has the same number of rows, so that an episode's outcome
@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lowlevel.commands import COMMAND_SIZE
-from lowlevel.control.controller import Controller
+from lowlevel.commands import COMMAND_SIZE, clamp_posture
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import MAP_REFRESH_STEPS, NoiseConfig
+from lowlevel.control.whole_body import HasExperts, WholeBodyController
 from lowlevel.world.measures import Measurement
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
 from lowlevel.world.terrain import TerrainConfig
@@ -68,7 +68,7 @@ class Episode:
     starts: tuple[float, ...]
     """When each command begins [s], ascending, the first at 0."""
     commands: Tensor
-    """(len(starts), 21); the controller clamps them."""
+    """(len(starts), 21); clamped to what the robot can hold, the same for every controller."""
     flags: Tensor
     """Tracking flag I of each command (len(starts),)."""
     tile: int = 0
@@ -98,7 +98,7 @@ class Moment:
     elevation: Tensor
     """The noisy elevation map that the controller saw (N, 121) [m]."""
     gate: Tensor
-    """Expert activations (N, experts)."""
+    """Expert activations (N, experts); without columns for a controller that has none."""
     work: Tensor
     """Of all motors in the step, both signs counted positive (N,) [J]."""
     number: Tensor
@@ -152,7 +152,7 @@ class Arena:
 
     def __init__(
         self,
-        controller: Controller,
+        controller: WholeBodyController,
         terrain: TerrainConfig,
         conditions: RandomizationConfig | None = None,
         noise: NoiseConfig = NoiseConfig(),  # noqa: B008 (frozen)
@@ -164,6 +164,7 @@ class Arena:
         self.world = World(ModelOptions(gains=controller.gains), terrain, batch, num_threads)
         self.simulation = self.world.simulation
         self.period = self.simulation.control_period
+        self.experts = controller.experts if isinstance(controller, HasExperts) else 0
         drawn = RandomizationConfig.for_evaluation() if conditions is None else conditions
         self._randomizer = Randomizer(drawn, self.simulation, torch.Generator())
         self._proprioception_noise = noise.proprioception()
@@ -233,7 +234,7 @@ class Arena:
                 flag=flag,
                 since_change=(step + 1 - starts[rows, current]) * self.period,
                 elevation=elevation.clone(),
-                gate=self.controller.gate,
+                gate=self._gate(),
                 work=work,
                 number=current,
                 active=active,
@@ -241,6 +242,9 @@ class Arena:
                 failed=failed,
             )
             up = up & ~fell & ~failed
+
+    def _gate(self) -> Tensor:
+        return self.controller.gate if isinstance(self.controller, HasExperts) else torch.zeros(self.batch, 0)
 
     # -- preparing a batch -----------------------------------------------------------------------------------
 
@@ -252,14 +256,14 @@ class Arena:
         most = max(len(episode.starts) for episode in episodes)
         starts = torch.full((self.batch, most), torch.iinfo(torch.long).max)
         starts[:, 0] = 0
-        commands = self.controller.config.command_space.neutral().repeat(self.batch, most, 1)
+        commands = self.controller.command_space.neutral().repeat(self.batch, most, 1)
         flags = torch.ones(self.batch, most, 1)
         for row, episode in enumerate(episodes):
             count = len(episode.starts)
             starts[row, :count] = torch.tensor([self._steps(start) for start in episode.starts])
             commands[row, :count] = episode.commands
             flags[row, :count, 0] = episode.flags
-        clamped = self.controller.clamp_command(commands.flatten(0, 1))
+        clamped = clamp_posture(commands.flatten(0, 1), self.world.pose)
         return starts, clamped.reshape(self.batch, most, COMMAND_SIZE), flags
 
     def _pushes(self, episodes: Sequence[Episode]) -> dict[int, Tensor]:
@@ -318,7 +322,7 @@ class Arena:
 
     def _stand(self, ids: Tensor, xy: Tensor, heading: Tensor, joint_spread: Tensor) -> None:
         """Put robots ``ids`` (n,) at rest in the nominal pose of the neutral command, feet just above the ground."""
-        neutral = self.controller.config.command_space.neutral().repeat(len(ids), 1)
+        neutral = self.controller.command_space.neutral().repeat(len(ids), 1)
         self.simulation.restart(ids)
         joints = self.world.stand(ids, xy, heading, neutral, joint_spread)
         self._randomizer.start(ids, joints)

@@ -122,7 +122,7 @@ def measure_latency(folder: Path, ticks: int) -> dict[str, Figure]:
             torch.zeros(1, 3),
             torch.tensor([[0.0, 0.0, -1.0]]),
         )
-        command = controller.config.command_space.neutral()[None]
+        command = controller.command_space.neutral()[None]
         elevation = torch.full((1, MAP_SIZE), 0.76)
         measured[f"controller_tick_{runtime}"] = partial(controller.act, state, elevation, command, torch.ones(1, 1))
     figures = {}

@@ -362,6 +362,6 @@ def run_modes(
     arena: Arena, episodes: Sequence[Episode], advance: Callable[[int], None] = lambda steps: None
 ) -> np.ndarray:
     """Mean expert activations (modes, experts) after the transient; NaN for modes that nobody survives."""
-    gates = record(arena, episodes, {"gate": Channel(lambda m: m.gate, (arena.controller.experts,))}, advance)
+    gates = record(arena, episodes, {"gate": Channel(lambda m: m.gate, (arena.experts,))}, advance)
     steady = gates["gate"][:, round(TRANSIENT / arena.period) :]
     return time_mean(steady.reshape(-1, MODE_EPISODES * steady.shape[1], steady.shape[2]))

@@ -128,6 +128,11 @@ class Controller:
         """Expert activations of the last :meth:`act` (N, experts)."""
 
     @property
+    def command_space(self) -> CommandSpace:
+        """What it can be told."""
+        return self.config.command_space
+
+    @property
     def experts(self) -> int:
         """Experts whose activations :attr:`gate` holds."""
         return self.step.experts

@@ -77,7 +77,7 @@ class LiftBoxExpert:
         self._environment, self._task = environment, task
         self._period = environment.decision_period
         self._arms = ArmKinematics()
-        self._neutral = environment.controller.config.command_space.neutral()
+        self._neutral = environment.controller.command_space.neutral()
         count = environment.num_envs
         self._memory = _Memory(
             phase=torch.zeros(count, dtype=torch.long),

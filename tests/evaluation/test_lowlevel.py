@@ -53,7 +53,7 @@ def arena(controller: Controller) -> Arena:
 
 
 def test_an_episode_is_the_same_in_evaluations_of_any_size(controller: Controller) -> None:
-    space = controller.config.command_space
+    space = controller.command_space
     few, many = protocol_episodes(space, 3, 7, 2), protocol_episodes(space, 20, 7, 2)
     for a, b in zip(few, many, strict=False):
         assert a.seed == b.seed and a.tile == b.tile and a.starts == b.starts == (0.0, 10.0)
@@ -62,7 +62,7 @@ def test_an_episode_is_the_same_in_evaluations_of_any_size(controller: Controlle
 
 
 def test_commands_follow_the_mixture(controller: Controller) -> None:
-    episodes = protocol_episodes(controller.config.command_space, 400, 0, 2)
+    episodes = protocol_episodes(controller.command_space, 400, 0, 2)
     commands = torch.cat([episode.commands for episode in episodes])
     group = group_of(commands, torch.cat([episode.flags for episode in episodes])[:, None])
     for index, share in enumerate((0.4, 0.4, 0.2)):
@@ -77,7 +77,7 @@ def test_commands_follow_the_mixture(controller: Controller) -> None:
 
 def two_commands(controller: Controller, count: int = 4) -> list[Episode]:
     """Episodes of two commands of 0.6 s; the first robot falls in its first one, the others stay up that long."""
-    space = controller.config.command_space
+    space = controller.command_space
     short = [
         replace(episode, duration=1.2, starts=(0.0, 0.6))
         for episode in protocol_episodes(space, count, seed=1, tiles=1)
@@ -188,9 +188,7 @@ def test_energy_per_meter_is_a_ratio_of_sums() -> None:
 
 
 def test_walking_counts_falls_and_speed(arena: Arena, controller: Controller) -> None:
-    episodes = [
-        replace(episode, duration=0.8) for episode in walking_episodes(controller.config.command_space, 2, 0, 1)
-    ]
+    episodes = [replace(episode, duration=0.8) for episode in walking_episodes(controller.command_space, 2, 0, 1)]
     assert episodes[0].commands[0, 0] == 0.5 and episodes[0].commands[0, 1:3].abs().max() == 0.0
     episodes[1] = replace(episodes[1], pushes=(Push(0.0, (0.0, 12.0, 0.0)),))
     figures = run_walking(arena, episodes)
@@ -206,7 +204,7 @@ def test_walking_counts_falls_and_speed(arena: Arena, controller: Controller) ->
 def test_activations_are_averaged_by_mode(arena: Arena, controller: Controller) -> None:
     import evaluation.protocols.tracking as tracking
 
-    space = controller.config.command_space
+    space = controller.command_space
     lower, upper = space.bounds()
     for mode in motion_modes(space).values():
         assert ((mode >= lower) & (mode <= upper)).all()

@@ -46,7 +46,7 @@ def column(chunks: list[Chunk], name: str) -> list:
 
 
 def test_an_episode_can_be_read_back(arena: Arena, twin: VisualTwin, tmp_path: Path) -> None:
-    command = arena.controller.config.command_space.neutral()
+    command = arena.controller.command_space.neutral()
     path = tmp_path / "episode.rrd"
     hand = HAND_BODIES[0]
     places, commanded = [], []
@@ -95,7 +95,7 @@ def test_a_live_view_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_twin_has_the_simulated_pose_and_sizes(arena: Arena, twin: VisualTwin) -> None:
-    (moment,) = list(arena.run([constant(0, 0.02, arena.controller.config.command_space.neutral(), flag=1.0)]))
+    (moment,) = list(arena.run([constant(0, 0.02, arena.controller.command_space.neutral(), flag=1.0)]))
     twin.adopt_sizes(arena.simulation, 0)
     twin.follow(arena.simulation, 0)
     np.testing.assert_allclose(twin.data.body("pelvis").xpos, moment.measured.robot.base_position[0], atol=1e-6)
@@ -115,7 +115,7 @@ def test_a_twin_of_another_scene_is_refused(arena: Arena) -> None:
 
 
 def test_map_points_lie_on_the_ground(arena: Arena) -> None:
-    neutral = arena.controller.config.command_space.neutral()
+    neutral = arena.controller.command_space.neutral()
     (moment,) = list(arena.run([constant(1, 0.02, neutral, flag=1.0)]))
     measured = moment.measured
     exact = arena.world.elevation(measured)
@@ -134,7 +134,7 @@ def test_measured_posture_inverts_the_command_convention(arena: Arena) -> None:
     """R = Rz(yaw) Ry(pitch) Rx(roll), built here from matrices."""
     from dataclasses import replace
 
-    neutral = arena.controller.config.command_space.neutral()
+    neutral = arena.controller.command_space.neutral()
     (moment,) = list(arena.run([constant(1, 0.02, neutral, flag=1.0)]))
     roll, pitch, yaw = 0.3, 1.2, -0.7
 

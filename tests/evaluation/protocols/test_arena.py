@@ -21,12 +21,14 @@ from evaluation.protocols.arena import (
     hand_forces,
     run_all,
 )
-from lowlevel.commands import HEIGHT, VELOCITY
+from lowlevel.commands import ARMS, HEIGHT, VELOCITY, command_space
 from lowlevel.control.controller import Controller
 from lowlevel.control.observation import NoiseConfig
 from lowlevel.world.randomization import RandomizationConfig
 from lowlevel.world.terrain import TerrainConfig
-from robots.g1.constants import FOOT_BODIES, HAND_BODIES, NUM_JOINTS
+from robots.g1.constants import FOOT_BODIES, HAND_BODIES, NUM_JOINTS, gain_set
+from robots.g1.model import build_spec, joint_limits
+from robots.g1.nominal_pose import NominalPose
 
 FLAT = TerrainConfig(tile_size=16.0)
 QUIET = NoiseConfig(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -43,7 +45,7 @@ def arena(controller: Controller) -> Arena:
 
 
 def standing(controller: Controller, count: int, duration: float = 0.2) -> list[Episode]:
-    command = controller.config.command_space.neutral()
+    command = controller.command_space.neutral()
     return [constant(episode_seeds(0, index)[1], duration, command, flag=1.0) for index in range(count)]
 
 
@@ -106,7 +108,7 @@ def test_friction_is_drawn_per_episode_and_decided_by_the_feet(arena: Arena, con
 
 
 def test_commands_switch_on_time_and_are_clamped(arena: Arena, controller: Controller) -> None:
-    neutral = controller.config.command_space.neutral()
+    neutral = controller.command_space.neutral()
     impossible = neutral.clone()
     impossible[HEIGHT], impossible[5] = 0.30, 1.5
     episode = Episode(1, 0.2, (0.0, 0.1), torch.stack([neutral, impossible]), torch.tensor([1.0, 0.0]))
@@ -194,17 +196,36 @@ def test_robots_that_lie_are_not_simulated(arena: Arena, controller: Controller)
     assert len(places) > 2 and torch.equal(places[0], places[-1])
 
 
+class Statue:
+    """A controller that is not PILOT's: it stands, whatever it is told."""
+
+    gains = gain_set("stiff")
+
+    def __init__(self, fails: Sequence[int] = ()) -> None:
+        self.fails = list(fails)
+        limits = joint_limits(build_spec().compile())
+        self.command_space = command_space(limits[:, 0].tolist(), limits[:, 1].tolist())
+
+    def reset(self, num_robots: int, ids: torch.Tensor | None = None) -> None:
+        """It remembers nothing."""
+
+    def act(self, *measured: object) -> torch.Tensor:
+        stands = NominalPose.load().lookup(torch.tensor([[0.76, 0.0, 0.0, 0.0]])).position
+        targets = torch.cat([stands, self.command_space.neutral()[None, ARMS]], dim=1).repeat(2, 1)
+        targets[self.fails] = torch.nan
+        return targets
+
+
+def test_any_controller_can_be_run() -> None:
+    arena = Arena(Statue(), FLAT, num_threads=1, batch=2)
+    episodes = [constant(seed, 1.0, Statue().command_space.neutral(), flag=1.0) for seed in range(2)]
+    moments = list(arena.run(episodes))
+    assert len(moments) == 50 and moments[-1].active.all()
+    assert moments[-1].gate.shape == (2, arena.experts) == (2, 0)
+
+
 def test_targets_that_are_not_finite_are_no_fall(controller: Controller) -> None:
-    class Failing:
-        def __getattr__(self, name: str) -> object:
-            return getattr(controller, name)
-
-        def act(self, *inputs: torch.Tensor) -> torch.Tensor:
-            targets = controller.act(*inputs)  # type: ignore[arg-type]
-            targets[1] = torch.nan
-            return targets
-
-    arena = Arena(Failing(), FLAT, num_threads=1, batch=2)  # type: ignore[arg-type]
+    arena = Arena(Statue(fails=[1]), FLAT, num_threads=1, batch=2)
     moments = list(arena.run(standing(controller, 2)))
     assert moments[0].failed.tolist() == [False, True] and not torch.stack([m.fell for m in moments]).any()
     assert len(moments) == 10 and not moments[1].active[1]

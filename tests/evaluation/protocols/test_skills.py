@@ -70,7 +70,7 @@ def standing_trace(duration: float, episodes: int = 1) -> Trace:
 
 
 def test_an_episode_is_the_same_in_tests_of_any_size(controller: Controller) -> None:
-    space = controller.config.command_space
+    space = controller.command_space
     for skill in SKILLS:
         few, many = skill_episodes(skill, space, 2, 7), skill_episodes(skill, space, 5, 7)
         assert len(many) == 5 and len({episode.seed for episode in many}) == 5
@@ -80,22 +80,20 @@ def test_an_episode_is_the_same_in_tests_of_any_size(controller: Controller) -> 
 
 
 def test_phases_become_commands_that_the_controller_does_not_change(controller: Controller) -> None:
-    (bend,) = skill_episodes(LOADED_BEND, controller.config.command_space, 1, 0)
+    (bend,) = skill_episodes(LOADED_BEND, controller.command_space, 1, 0)
     assert bend.starts == (0.0, 2.0, 9.0) and bend.duration == 13.0 and bend.load == BOX_LOAD
     assert bend.commands[:, 3].tolist() == pytest.approx([0.76, 0.38, 0.76])
     assert bend.commands[:, 5].tolist() == pytest.approx([0.0, 1.2, 0.0])
     np.testing.assert_allclose(bend.commands[:, 7:], np.tile(HOLDING_ARMS, (3, 1)), atol=1e-6)
     torch.testing.assert_close(controller.clamp_command(bend.commands), bend.commands)
-    (stop,) = skill_episodes(STOP, controller.config.command_space, 1, 0)
+    (stop,) = skill_episodes(STOP, controller.command_space, 1, 0)
     assert stop.starts == (0.0, 4.0) and stop.commands[:, 0].tolist() == pytest.approx([0.6, 0.0])
-    with_load, without = (
-        skill_episodes(s, controller.config.command_space, 3, 0) for s in (LOADED_BEND, UNLOADED_BEND)
-    )
+    with_load, without = (skill_episodes(s, controller.command_space, 3, 0) for s in (LOADED_BEND, UNLOADED_BEND))
     assert [e.seed for e in with_load] == [e.seed for e in without] and without[0].load is None
 
 
 def test_pushes_are_horizontal_equally_strong_and_point_everywhere(controller: Controller) -> None:
-    episodes = skill_episodes(PUSH, controller.config.command_space, 200, 0)
+    episodes = skill_episodes(PUSH, controller.command_space, 200, 0)
     assert all([push.time for push in episode.pushes] == [1.0, 4.0] for episode in episodes)
     changes = np.array([push.velocity_change for episode in episodes for push in episode.pushes])
     np.testing.assert_allclose(np.linalg.norm(changes[:, :2], axis=1), PUSH_SPEED)
@@ -226,7 +224,7 @@ def test_a_bar_is_met_by_reaching_it() -> None:
 def test_a_trace_is_what_was_measured_and_ends_with_a_fall(controller: Controller) -> None:
     arena = Arena(controller, FLAT, num_threads=1, batch=2)
     skill = replace(PUSH, phases=(Phase(0.5),), push_times=())
-    episodes = skill_episodes(skill, controller.config.command_space, 3, 0)
+    episodes = skill_episodes(skill, controller.command_space, 3, 0)
     episodes[0] = replace(episodes[0], pushes=(Push(0.0, (0.0, 12.0, 0.0)),))
     trace = record(arena, episodes, CHANNELS)
     assert trace.fell.any(axis=1).tolist() == [True, False, False]
@@ -249,7 +247,7 @@ def test_the_box_pushes_the_palms_apart_and_down(controller: Controller) -> None
     arena = Arena(controller, FLAT, num_threads=1, batch=2)
     short = replace(LOADED_BEND, phases=(Phase(1.2),), measured=(1.0, 1.2), load=replace(BOX_LOAD, begin=0.5))
     loaded, unloaded = (
-        record(arena, skill_episodes(skill, controller.config.command_space, 2, 0), CHANNELS)
+        record(arena, skill_episodes(skill, controller.command_space, 2, 0), CHANNELS)
         for skill in (short, replace(short, load=None))
     )
     assert not loaded.fell.any() and not unloaded.fell.any()

@@ -33,7 +33,7 @@ class _Standing:
         self.resets: list[list[int]] = []
 
     def act(self, observation: Tensor) -> Tensor:
-        neutral = self._environment.controller.config.command_space.neutral()
+        neutral = self._environment.controller.command_space.neutral()
         return self._environment.action_map.action(neutral.repeat(len(observation), 1))
 
     def reset(self, ids: Tensor) -> None:

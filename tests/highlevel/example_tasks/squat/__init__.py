@@ -72,7 +72,7 @@ class SquatExpert:
         self._environment, self._task = environment, environment.task
 
     def act(self, observation: Tensor) -> Tensor:
-        command = self._environment.controller.config.command_space.neutral().repeat(len(observation), 1)
+        command = self._environment.controller.command_space.neutral().repeat(len(observation), 1)
         command[:, HEIGHT] = self._task.wanted
         return self._environment.action_map.action(command)
 
