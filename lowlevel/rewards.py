@@ -81,33 +81,43 @@ class Transition:
         return torso_error(self.measured, self.command)
 
 
-def linear_velocity(t: Transition) -> Tensor:
-    """Laplace kernel on the horizontal velocity error, scale 0.3 m/s.
+def laplace(error: Tensor, width: float) -> Tensor:
+    """1 without error, 1/e at ``width``. Unlike a Gaussian it keeps its slope down to the goal."""
+    return torch.exp(-error.abs() / width)
+
+
+def gaussian(squared_error: Tensor, variance: float) -> Tensor:
+    """1 without error, 1/e at a squared error of ``variance``."""
+    return torch.exp(-squared_error / variance)
+
+
+def linear_velocity(t: Transition, width: float = 0.3) -> Tensor:
+    """Tracking of the commanded vx and vy; ``width`` [m/s].
 
     A Gaussian of standard deviation 0.5 m/s pays 0.7 to a robot that marches in place when told to walk at 0.3 m/s.
     """
-    return torch.exp(-velocity_error(t.measured, t.command)[:, :2].norm(dim=-1) / 0.3)
+    return laplace(velocity_error(t.measured, t.command)[:, :2].norm(dim=-1), width)
 
 
-def angular_velocity(t: Transition) -> Tensor:
-    """Laplace kernel on the yaw rate error, scale 0.5 rad/s: it still has a slope for a robot that shakes."""
-    return torch.exp(-velocity_error(t.measured, t.command)[:, 2].abs() / 0.5)
+def angular_velocity(t: Transition, width: float = 0.5) -> Tensor:
+    """Tracking of the commanded yaw rate; ``width`` [rad/s]: it still has a slope for a robot that shakes."""
+    return laplace(velocity_error(t.measured, t.command)[:, 2], width)
 
 
-def base_height(t: Transition) -> Tensor:
-    """Laplace kernel on the base height error, scale 5 cm: it keeps its slope down to the last millimeter."""
-    return torch.exp(-height_error(t.measured, t.command).abs() / 0.05)
+def base_height(t: Transition, width: float = 0.05) -> Tensor:
+    """Tracking of the commanded pelvis height; ``width`` [m]."""
+    return laplace(height_error(t.measured, t.command), width)
 
 
-def torso_orientation(t: Transition) -> Tensor:
-    """Laplace kernel on the torso attitude error, scale 0.3 rad."""
-    return torch.exp(-t.torso_error.abs().sum(-1) / 0.3)
+def torso_orientation(t: Transition, width: float = 0.3) -> Tensor:
+    """Tracking of the commanded torso attitude; ``width`` [rad], of the three errors' sum."""
+    return laplace(t.torso_error.abs().sum(-1), width)
 
 
-def upper_body_position(t: Transition) -> Tensor:
-    """Laplace kernel on the summed arm error, scale 1 rad; a third of the error counts when I = 0."""
+def upper_body_position(t: Transition, width: float = 1.0) -> Tensor:
+    """Tracking of the commanded arms; ``width`` [rad], of all errors' sum, a third of which counts when I = 0."""
     strictness = 0.3 + 0.7 * t.flag[:, 0]
-    return torch.exp(-strictness * arm_error(t.measured, t.command).abs().sum(-1))
+    return laplace(strictness * arm_error(t.measured, t.command).abs().sum(-1), width)
 
 
 def termination(t: Transition) -> Tensor:
@@ -181,7 +191,7 @@ def _feet_apart(t: Transition) -> Tensor:
 def foot_phase(t: Transition, variance: float = 0.003) -> Tensor:
     """Kernel on the sole heights against the gait clock, ``variance`` [m^2]: swing foot up, stance foot down."""
     wanted = SWING_HEIGHT * _lift(t).clamp_min(0.0).square()
-    return torch.exp(-(t.measured.foot_clearance - wanted).square().sum(-1) / variance)
+    return gaussian((t.measured.foot_clearance - wanted).square().sum(-1), variance)
 
 
 def contact_schedule(t: Transition) -> Tensor:
@@ -206,7 +216,7 @@ def foot_placement(t: Transition, variance: float = 0.02) -> Tensor:
     wanted = t.command[:, :2] * stride[:, None]
     wanted[:, 1] += STANCE_WIDTH
     error = (_feet_apart(t) - wanted).square().sum(-1)
-    return torch.where(t.walking, torch.exp(-error / variance), 1.0)
+    return torch.where(t.walking, gaussian(error, variance), 1.0)
 
 
 def alive(t: Transition) -> Tensor:
@@ -216,25 +226,25 @@ def alive(t: Transition) -> Tensor:
 
 def linear_velocity_fine(t: Transition, variance: float = 0.04) -> Tensor:
     """Narrow Gaussian kernel on the horizontal velocity error, ``variance`` [m^2/s^2]."""
-    return torch.exp(-velocity_error(t.measured, t.command)[:, :2].square().sum(-1) / variance)
+    return gaussian(velocity_error(t.measured, t.command)[:, :2].square().sum(-1), variance)
 
 
 def angular_velocity_fine(t: Transition, variance: float = 0.04) -> Tensor:
     """Narrow Gaussian kernel on the yaw rate error, ``variance`` [rad^2/s^2]."""
-    return torch.exp(-velocity_error(t.measured, t.command)[:, 2].square() / variance)
+    return gaussian(velocity_error(t.measured, t.command)[:, 2].square(), variance)
 
 
-def mean_linear_velocity(t: Transition) -> Tensor:
-    """Laplace kernel on the mean horizontal velocity error, scale 0.1 m/s.
+def mean_linear_velocity(t: Transition, width: float = 0.1) -> Tensor:
+    """Tracking of vx and vy on average; ``width`` [m/s].
 
     The pelvis sways by as much with every step: at once, a drift of 0.1 m/s hardly changes the kernels above.
     """
-    return torch.exp(-t.mean_velocity_error[:, :2].norm(dim=-1) / 0.1)
+    return laplace(t.mean_velocity_error[:, :2].norm(dim=-1), width)
 
 
-def mean_angular_velocity(t: Transition) -> Tensor:
-    """Laplace kernel on the mean yaw rate error, scale 0.15 rad/s."""
-    return torch.exp(-t.mean_velocity_error[:, 2].abs() / 0.15)
+def mean_angular_velocity(t: Transition, width: float = 0.15) -> Tensor:
+    """Tracking of the yaw rate on average; ``width`` [rad/s]."""
+    return laplace(t.mean_velocity_error[:, 2], width)
 
 
 def vertical_velocity(t: Transition) -> Tensor:

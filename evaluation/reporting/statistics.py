@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import numpy as np
+from scipy import stats
 
 CONFIDENCE = 0.95
 RESAMPLES = 4000
@@ -35,12 +34,8 @@ def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE)
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(f"{successes} successes in {trials} trials give no share")
-    z = NormalDist().inv_cdf(0.5 + 0.5 * confidence)
-    share = successes / trials
-    scale = 1.0 / (1.0 + z * z / trials)
-    middle = scale * (share + 0.5 * z * z / trials)
-    half_width = scale * z * math.sqrt(share * (1.0 - share) / trials + 0.25 * z * z / trials**2)
-    return max(0.0, middle - half_width), min(1.0, middle + half_width)
+    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def mean_interval(
@@ -56,12 +51,10 @@ def mean_interval(
     values = np.asarray(episode_means, dtype=float)
     if len(values) < 2:
         raise ValueError("an interval of a mean takes at least two episodes")
-    rng = np.random.default_rng(seed)
-    # How often each episode is drawn is multinomial, which makes the resampling one matrix product.
-    counts = rng.multinomial(len(values), np.full(len(values), 1.0 / len(values)), size=RESAMPLES)
-    tail = 50.0 * (1.0 - confidence)
-    low, high = np.percentile(counts @ values / len(values), [tail, 100.0 - tail])
-    return float(low), float(high)
+    resampled = stats.bootstrap(
+        (values,), np.mean, n_resamples=RESAMPLES, confidence_level=confidence, method="percentile", rng=seed
+    )
+    return float(resampled.confidence_interval.low), float(resampled.confidence_interval.high)
 
 
 def mean_figure(episode_means: Sequence[float] | np.ndarray, unit: str) -> Figure:
@@ -84,10 +77,9 @@ def share_figure(happened: Sequence[bool] | np.ndarray) -> Figure:
 
 def quantile_figure(samples: Sequence[float] | np.ndarray, quantile: float, unit: str) -> Figure:
     """A quantile of independent samples, with the distribution-free interval between two order statistics."""
-    values = np.sort(np.asarray(samples, dtype=float))
-    count = len(values)
-    z = NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
-    spread = z * math.sqrt(count * quantile * (1.0 - quantile))
-    low, high = (round(count * quantile + shift) for shift in (-spread, spread))
-    ends = values[max(0, low)], values[min(count - 1, high)]
-    return Figure(float(np.quantile(values, quantile)), unit, (float(ends[0]), float(ends[1])), count)
+    values = np.asarray(samples, dtype=float)
+    value = float(np.quantile(values, quantile))
+    interval = stats.quantile_test(values, q=value, p=quantile).confidence_interval(CONFIDENCE)
+    # An end that so few samples cannot tell is that of the samples.
+    ends = float(np.nanmax([interval.low, values.min()])), float(np.nanmin([interval.high, values.max()]))
+    return Figure(value, unit, ends, len(values))
