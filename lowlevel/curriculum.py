@@ -28,9 +28,9 @@ class CurriculumConfig:
     """Growth of an opening per update."""
     quality: float = 0.45
     """Quality of tracking above which a kind may grow, under the noise of exploration."""
-    steps_between_falls: float = 2000.0
+    steps_between_falls: float = 600.0
     """Control steps of a kind per fall above which it may grow; below half as many it shrinks. Where every robot falls
-    no action is better than another, and nothing is learned."""
+    no action is better than another, and nothing is learned. The same for the hardness, by the falls of all kinds."""
     smoothing: float = 0.1
     """Weight of the last update in the measured averages."""
     most_often: float = 2.0
@@ -47,6 +47,8 @@ class Curriculum:
         self.quality = torch.zeros(count)
         self.fall_rate = torch.full((count,), 0.05)
         """Falls per control step."""
+        self.hardness = torch.zeros(())
+        """How hard the conditions are, in [0, 1], in stages that make them harder."""
         self._sums = torch.zeros(3, count)
 
     def observe(self, kind: Tensor, terms: dict[str, Tensor], fallen: Tensor) -> None:
@@ -55,8 +57,11 @@ class Curriculum:
         for row, values in zip(self._sums, (torch.ones_like(quality), quality, fallen.float()), strict=True):
             row.index_add_(0, kind.cpu(), values.cpu())
 
-    def update(self) -> None:
-        """Take in what was observed since the last update, over all ranks, and open what is tracked."""
+    def update(self, hardens: bool = False) -> None:
+        """Take in what was observed since the last update, over all ranks, and open what is tracked.
+
+        The hardness moves only if the stage ``hardens``.
+        """
         config = self.config
         steps, quality, falls = sum_over_ranks(self._sums)
         seen = steps > 0
@@ -64,10 +69,13 @@ class Curriculum:
         self.quality += weight * (quality / steps.clamp_min(1.0) - self.quality)
         self.fall_rate += weight * (falls / steps.clamp_min(1.0) - self.fall_rate)
         falls_per_budget = self.fall_rate * config.steps_between_falls
-        grows = seen & (self.quality > config.quality) & (falls_per_budget < 1.0)
-        shrinks = seen & (falls_per_budget > 2.0)
-        change = config.growth * (grows.float() - shrinks.float())
+        grows, shrinks = (falls_per_budget < 1.0).float(), (falls_per_budget > 2.0).float()
+        change = config.growth * (grows * (self.quality > config.quality) - shrinks) * seen
         self.opening = (self.opening + change).clamp(config.start, 1.0)
+        if hardens:
+            of_all = (falls_per_budget * steps).sum() / steps.sum()
+            change = config.growth * ((of_all < 1.0).float() - (of_all > 2.0).float())
+            self.hardness = (self.hardness + change).clamp(0.0, 1.0)
         self._sums = torch.zeros_like(self._sums)
 
     def probabilities(self, shares: Tensor) -> Tensor:
@@ -78,8 +86,8 @@ class Curriculum:
         return shares * factor / (shares * factor).sum()
 
     def figures(self, shares: Tensor) -> dict[str, float]:
-        """Openings, qualities and falls of the kinds that are drawn, by name."""
-        result = {}
+        """Hardness, and openings, qualities and falls of the kinds that are drawn, by name."""
+        result = {"hardness": float(self.hardness)}
         for number, name in enumerate(KINDS):
             if shares[number] > 0.0:
                 result[f"opening/{name}"] = float(self.opening[number])
@@ -88,7 +96,9 @@ class Curriculum:
         return result
 
     def state_dict(self) -> dict[str, Tensor]:
-        return {"opening": self.opening, "quality": self.quality, "fall_rate": self.fall_rate}
+        names = ("opening", "quality", "fall_rate", "hardness")
+        return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.opening, self.quality, self.fall_rate = (state[name].clone() for name in self.state_dict())
+        for name in self.state_dict():
+            setattr(self, name, state[name].clone())

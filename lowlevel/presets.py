@@ -57,6 +57,9 @@ GENTLE = RandomizationConfig(
 FIRM = replace(GENTLE, push_velocity=0.4)
 """For one that can catch itself by a step."""
 
+HARD = RandomizationConfig()
+"""For a controller that is to be shipped: loads in the hands, late and weak motors, slippery ground, hard pushes."""
+
 EVERYTHING = (
     ("steer", 0.15),
     ("slow", 0.15),
@@ -147,12 +150,16 @@ STAGES = (
     ),
     Stage(
         "harden",
-        most_steps=60_000_000,
+        waits_for="curriculum/hardness",
+        above=0.98,
+        most_steps=40_000_000,
         std=(0.04, 0.1),
-        rollout_doublings=2,
+        rollout_doublings=1,
         mixture=EVERYTHING,
         terrain=SLABS,
         rewards=STEPPING,
+        randomization=FIRM,
+        harder=HARD,
     ),
     Stage(
         "refine",
@@ -162,6 +169,8 @@ STAGES = (
         mixture=EVERYTHING,
         terrain=SLABS,
         rewards=TRACKING,
+        randomization=FIRM,
+        harder=HARD,
     ),
 )
 """From nothing to the controller: balance with a gait prior, walk with it, absorb it, then open one kind of command

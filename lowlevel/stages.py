@@ -44,6 +44,9 @@ class Stage:
     terrain: TerrainConfig = field(default_factory=TerrainConfig)
     rewards: RewardWeights = field(default_factory=RewardWeights)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    harder: RandomizationConfig | None = None
+    """What ``randomization`` becomes as far as falls allow (:attr:`lowlevel.curriculum.Curriculum.hardness`), if
+    anything."""
 
     def environment(self, base: EnvironmentConfig) -> EnvironmentConfig:
         """The task in this stage."""

@@ -34,6 +34,7 @@ from lowlevel.runs.run_folder import RunFolder
 from lowlevel.stages import Stage
 from lowlevel.world.measures import TRACKING_FIGURES
 from lowlevel.world.privileged import MIRRORS, PRIVILEGED, PRIVILEGED_SIZE
+from lowlevel.world.randomization import between
 from robots.errors import PilotError
 from robots.g1.constants import LOWER_JOINTS, NUM_JOINTS
 
@@ -145,6 +146,9 @@ class Trainer:
     def _apply_curriculum(self) -> None:
         self.environment.opening = self.curriculum.opening
         self.environment.kind_probability = self.curriculum.probabilities(self._shares)
+        easy, hard = self.stage.randomization, self.stage.harder
+        if hard is not None:
+            self.environment.randomizer.config = between(easy, hard, float(self.curriculum.hardness))
 
     def _follow_stages(self, figures: dict[str, float], report: Callable[[str], None]) -> None:
         """Begin the next stage once the figure that this one waits for is reached, or its steps are used up."""
@@ -222,7 +226,7 @@ class Trainer:
         self.fall_rate += 0.1 * (fallen - self.fall_rate)
         # No more than were taken: a run that has not fallen yet does not stand for ever.
         steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
-        self.curriculum.update()
+        self.curriculum.update(hardens=self.stage.harder is not None)
         self._apply_curriculum()
         if self.stage.fits_prior:
             self.environment.prior.fit()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,7 +46,7 @@ class RandomizationConfig:
     """Downward force on each hand [N]."""
     hand_squeeze: tuple[float, float] = (-30.0, 10.0)
     """Force on each hand towards the other one [N]; negative pushes outwards, as a squeezed box does."""
-    start_velocity: float = 0.2
+    start_velocity: float = 0.1
     """Largest velocity of the base at the start of an episode, per axis [m/s]."""
     push_velocity: float = 0.8
     """Largest horizontal velocity change of a push, per axis [m/s]."""
@@ -67,6 +68,19 @@ class RandomizationConfig:
             start_velocity=0.0,
             push_velocity=0.0,
         )
+
+
+def between(easy: RandomizationConfig, hard: RandomizationConfig, hardness: float) -> RandomizationConfig:
+    """Ranges on the way from ``easy``, at a ``hardness`` of 0, to ``hard``, at 1."""
+
+    def mix(begin: float, end: float) -> float:
+        return begin + hardness * (end - begin)
+
+    mixed: dict[str, Any] = {}
+    for field in fields(easy):
+        begin, end = getattr(easy, field.name), getattr(hard, field.name)
+        mixed[field.name] = tuple(map(mix, begin, end)) if isinstance(begin, tuple) else mix(begin, end)
+    return RandomizationConfig(**mixed)
 
 
 @dataclass
@@ -94,6 +108,7 @@ class Randomizer:
 
     def __init__(self, config: RandomizationConfig, simulation: BatchSimulation, generator: torch.Generator) -> None:
         self.config = config
+        """May change between two steps."""
         self.simulation = simulation
         self.generator = generator
         model, count, device = simulation.model, simulation.num_robots, simulation.device

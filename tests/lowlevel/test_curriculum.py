@@ -51,6 +51,21 @@ def test_what_is_tracked_badly_is_drawn_more_often_down_to_a_floor() -> None:
     assert chance["forward"] == 0.0
 
 
+def test_conditions_become_harder_while_few_robots_fall_and_only_where_they_may() -> None:
+    curriculum = Curriculum(CurriculumConfig())
+    kind, quality = torch.zeros(1000, dtype=torch.long), {term: torch.ones(1000) for term in QUALITY_TERMS}
+
+    def update(fall_rate: float, hardens: bool = True) -> float:
+        curriculum.observe(kind, quality, torch.arange(1000) < 1000 * fall_rate)
+        curriculum.update(hardens)
+        return float(curriculum.hardness)
+
+    assert [update(0.0, hardens=False) for _ in range(60)][-1] == 0.0
+    hardest = [update(0.0) for _ in range(400)][-1]
+    assert hardest == 1.0
+    assert [update(0.01) for _ in range(60)][-1] < 0.9
+
+
 def test_state_round_trip() -> None:
     curriculum, other = Curriculum(CurriculumConfig()), Curriculum(CurriculumConfig())
     for _ in range(10):

@@ -11,6 +11,7 @@ import torch
 
 from lowlevel.absorption import AbsorptionConfig, absorb_prior
 from lowlevel.commands import KINDS
+from lowlevel.curriculum import CurriculumConfig
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 from lowlevel.learning.ppo import PPOConfig
 from lowlevel.networks.config import NetworkConfig
@@ -104,3 +105,20 @@ def test_stages_of_presets_wait_for_figures_that_are_logged(name: str, tmp_path:
         trainer.observation = trainer.environment.reset()
         figures = trainer.iterate()
         assert not stage.waits_for or math.isfinite(figures[stage.waits_for])
+
+
+def test_a_stage_makes_its_conditions_harder(tmp_path: Path) -> None:
+    easy = RandomizationConfig.for_evaluation()
+    trainer = Trainer(
+        tiny(replace(SECOND, randomization=easy, harder=RandomizationConfig(push_velocity=2.0))), tmp_path
+    )
+    assert trainer.environment.randomizer.config == easy
+    trainer.observation = trainer.environment.reset()
+    trainer.curriculum.fall_rate.zero_()
+    hardness = trainer.iterate()["curriculum/hardness"]
+    assert hardness == pytest.approx(CurriculumConfig().growth)
+    assert trainer.environment.randomizer.config.push_velocity == pytest.approx(2.0 * hardness)
+    trainer.save()
+    resumed = Trainer(trainer.config, tmp_path)
+    resumed.load()
+    assert resumed.environment.randomizer.config == trainer.environment.randomizer.config
