@@ -28,7 +28,7 @@ class CurriculumConfig:
     """Growth of an opening per update."""
     quality: float = 0.45
     """Quality of tracking above which a kind may grow, under the noise of exploration."""
-    steps_between_falls: float = 600.0
+    steps_between_falls: float = 300.0
     """Control steps of a kind per fall above which it may grow; below half as many it shrinks. Where every robot falls
     no action is better than another, and nothing is learned. The same for the hardness, by the falls of all kinds."""
     smoothing: float = 0.1

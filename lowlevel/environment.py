@@ -293,7 +293,7 @@ class PilotEnvironment:
         reach = 0.5 * self.config.terrain.tile_size - 1.0
         xy = centers[tile] + self._uniform(-reach, reach, count, 2)
         base_velocity = torch.zeros(count, 6, device=self.device)
-        fastest = self.config.randomization.start_velocity
+        fastest = self.randomizer.config.start_velocity
         base_velocity[:, :3] = self._uniform(-fastest, fastest, count, 3)
         base_velocity[:, :2] += rotate_about_vertical(heading, velocity[:, :2])
         self.randomizer.draw(ids)

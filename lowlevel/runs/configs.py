@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, is_dataclass
+from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 _ACCEPTED: dict[type, tuple[type, ...]] = {bool: (bool,), int: (int,), float: (int, float), str: (str,)}
@@ -11,6 +12,8 @@ _ACCEPTED: dict[type, tuple[type, ...]] = {bool: (bool,), int: (int,), float: (i
 
 def from_plain(kind: type, value: Any, name: str = "the configuration") -> Any:
     """Rebuild nested dataclasses and tuples from what ``dataclasses.asdict`` and JSON made of them.
+
+    The only unions are those with None, written ``X | None``.
 
     ``name`` is what messages call ``value``.
 
@@ -29,6 +32,8 @@ def from_plain(kind: type, value: Any, name: str = "the configuration") -> Any:
         for absent in sorted(names - set(value)):
             raise KeyError(f"{kind.__name__} lacks its field {absent!r}")
         return kind(**{field: from_plain(hints[field], item, field) for field, item in value.items()})
+    if get_origin(kind) is UnionType:
+        return None if value is None else from_plain(get_args(kind)[0], value, name)
     if get_origin(kind) is tuple:
         inner = get_args(kind)
         if not isinstance(value, (list, tuple)):

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 
+from lowlevel.presets import PRESETS
 from lowlevel.runs.configs import from_plain
 from lowlevel.trainer import TrainingConfig
 
 
-def test_a_configuration_comes_back_from_json_as_it_was() -> None:
-    config = TrainingConfig(total_steps=7)
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_configuration_comes_back_from_json_as_it_was(name: str) -> None:
+    config = replace(PRESETS[name], total_steps=7)
     assert from_plain(TrainingConfig, json.loads(json.dumps(asdict(config)))) == config
 
 
