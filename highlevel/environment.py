@@ -178,7 +178,7 @@ class CommandEnvironment:
 
         Raises:
             RuntimeError: if :meth:`reset` was not called.
-            PilotError: if the action has another shape or is not finite.
+            ValueError: if the action has another shape or is not finite.
         """
         if self.measured is None:
             raise RuntimeError("call reset() before step()")

@@ -144,7 +144,7 @@ def joint_deviation(t: Transition) -> Tensor:
 
 
 def feet_stumble(t: Transition) -> Tensor:
-    """A loaded foot is pushed sideways harder than upwards."""
+    """A loaded foot is pushed sideways at least as hard as upwards."""
     return stumbles(t.measured).float()
 
 

@@ -145,9 +145,6 @@ class Arena:
         noise: observation noise.
         num_threads: physics threads.
         batch: robots simulated side by side (N).
-
-    Raises:
-        PilotError: if the controller runs at another rate.
     """
 
     def __init__(

@@ -276,7 +276,7 @@ def paired_differences(ours: CommandTable, other: CommandTable) -> dict[str, Fig
     """Ours minus the other's, episode by episode of the same seeds, by column.
 
     Raises:
-        PilotError: if the tables are not of the same episodes.
+        ValueError: if the tables are not of the same episodes.
     """
     if not np.array_equal(ours.episode, other.episode):
         raise ValueError("only tables of the same episodes can be compared")

@@ -216,7 +216,7 @@ class PPO:
 
         Raises:
             NonFiniteError: if a loss or a gradient is not finite; the step in question is not taken.
-            PilotError: if the rollout is not full.
+            ValueError: if the rollout is not full.
         """
         storage, config = self.storage, self.config
         if not storage.full:

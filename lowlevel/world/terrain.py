@@ -1,7 +1,8 @@
 """Terrain as boxes on a plane: one list of boxes makes both the collision geometry and the height raster.
 
 Every robot of a batch lives in the same world, so the whole terrain is part of one shared model. A tile is a
-square patch made by one function of :data:`TILES`; adding stairs or platforms means adding a function.
+square patch made by one function of :data:`TILES`. To add stairs or platforms, add a function there, and name it in the
+terrain of a stage (:mod:`lowlevel.presets`) and in ``evaluation.protocols.tracking.SUITES``.
 """
 
 from __future__ import annotations

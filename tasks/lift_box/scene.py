@@ -43,7 +43,7 @@ def add_box_scene(spec: mujoco.MjSpec) -> None:
     box.contype, box.conaffinity = WORLD_COLLISION, WORLD_COLLISION | PALM_COLLISION
     box.condim = 4
     # Of floor, block and box alike; hands and feet bring their own, which has priority.
-    box.friction = [1.0, 0.005, 0.0001]
+    box.friction = [1.0, 0.005, 0.0001]  # against floor and block; against palms that of the palms counts
     box.rgba = [0.80, 0.55, 0.25, 1.0]
 
     shell = spec.body(TORSO_BODY).add_geom(name="torso_shell", type=mujoco.mjtGeom.mjGEOM_BOX)

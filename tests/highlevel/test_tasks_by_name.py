@@ -29,10 +29,10 @@ def test_an_unknown_task_is_refused_with_the_list_of_tasks() -> None:
 def test_highlevel_knows_no_task_by_name() -> None:
     source = Path(highlevel.__file__).parent
     names = {word for name in task_names() for word in (name, name.replace("_", ""))}
-    for path in source.glob("*.py"):
+    for path in source.rglob("*.py"):
         code = [line for line in path.read_text().splitlines() if '"""' not in line]
         for number, line in enumerate(code):
-            is_default = path.name == "training_config.py" and 'task: str = "' in line
+            is_default = path.name == "config.py" and 'task: str = "' in line
             is_prose = path.name in ("__init__.py", "task.py") and "``" in line
             if not (is_default or is_prose):
                 assert not any(word in line.lower().replace("/", "") for word in names), f"{path.name}: {number}"
