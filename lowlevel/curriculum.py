@@ -30,7 +30,8 @@ class CurriculumConfig:
     """Quality of tracking above which a kind may grow, under the noise of exploration."""
     steps_between_falls: float = 300.0
     """Control steps of a kind per fall above which it may grow; below half as many it shrinks. Where every robot falls
-    no action is better than another, and nothing is learned. The same for the hardness, by the falls of all kinds."""
+    no action is better than another, and nothing is learned. For the hardness all kinds together must fall half as
+    often."""
     smoothing: float = 0.1
     """Weight of the last update in the measured averages."""
     most_often: float = 2.0
@@ -74,7 +75,7 @@ class Curriculum:
         self.opening = (self.opening + change).clamp(config.start, 1.0)
         if hardens:
             of_all = (falls_per_budget * steps).sum() / steps.sum()
-            change = config.growth * ((of_all < 1.0).float() - (of_all > 2.0).float())
+            change = config.growth * ((of_all < 0.5).float() - (of_all > 1.0).float())
             self.hardness = (self.hardness + change).clamp(0.0, 1.0)
         self._sums = torch.zeros_like(self._sums)
 
