@@ -27,8 +27,10 @@ TRACKING = RewardWeights(
     feet_close=-10.0,
     stand_still=-1.0,
     torque_limits=-0.1,
+    feet_stumble=-30.0,
 )
-"""Tracking counts for more than in the paper, and with it what is added to it."""
+"""Tracking counts for more than in the paper, and with it what is added to it. Two thirds of the falls on slabs follow
+a foot that ran into an edge: a price on that says at once which swing was too low."""
 
 SHAPED = replace(
     TRACKING,
@@ -118,14 +120,26 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
+        "uneven",
+        waits_for="curriculum/steps_between_falls/steer",
+        above=4000.0,
+        most_steps=8_000_000,
+        std=(0.05, 0.1),
+        mixture=(("forward", 0.2), ("steer", 0.5), ("slow", 0.15), ("stand", 0.15)),
+        terrain=SLABS,
+        rewards=STEPPING,
+        randomization=FIRM,
+    ),
+    Stage(
         "squat",
         waits_for="curriculum/opening/squat",
         above=0.98,
         most_steps=8_000_000,
         std=(0.05, 0.1),
         mixture=(("steer", 0.4), ("slow", 0.1), ("stand", 0.1), ("squat", 0.4)),
+        terrain=SLABS,
         rewards=STEPPING,
-        randomization=GENTLE,
+        randomization=FIRM,
     ),
     Stage(
         "bend and reach",
@@ -134,6 +148,7 @@ STAGES = (
         most_steps=15_000_000,
         std=(0.05, 0.1),
         mixture=(("steer", 0.3), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.5)),
+        terrain=SLABS,
         rewards=STEPPING,
         randomization=FIRM,
     ),
@@ -145,6 +160,7 @@ STAGES = (
         std=(0.05, 0.1),
         rollout_doublings=1,
         mixture=(("steer", 0.2), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.2), ("walk_and_work", 0.4)),
+        terrain=SLABS,
         rewards=STEPPING,
         randomization=FIRM,
     ),
@@ -173,8 +189,9 @@ STAGES = (
         harder=HARD,
     ),
 )
-"""From nothing to the controller: balance with a gait prior, walk with it, absorb it, then open one kind of command
-after the other, then everything with rougher ground and disturbances, at last with less noise and without shaping."""
+"""From nothing to the controller: balance with a gait prior, walk with it, absorb it, steer, on uneven ground too, then
+open one kind of command after the other, then everything with disturbances, at last with less noise and without
+shaping."""
 
 
 def _paper_weights(stage: Stage) -> Stage:

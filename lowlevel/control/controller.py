@@ -21,7 +21,7 @@ import torch
 from google.protobuf.message import DecodeError
 from torch import Tensor
 
-from lowlevel.commands import CommandSpace, clamp_posture
+from lowlevel.commands import POSTURE, VELOCITY, WALKING_POSTURE, CommandSpace, clamp_posture
 from lowlevel.control.control_step import ControlStep, Memory
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.golden import GOLDEN_ROBOTS, golden_vectors
@@ -37,6 +37,7 @@ from lowlevel.control.observation import (
 from lowlevel.control.onnx_step import OnnxStep, export_step
 from lowlevel.control.reference import Reference, ReferenceConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes, PilotActor
+from lowlevel.control.whole_body import Bounds, Supports
 from lowlevel.runs.configs import from_plain
 from lowlevel.runs.files import atomic_write
 from lowlevel.runs.frozen_folder import FrozenFolder
@@ -131,6 +132,17 @@ class Controller:
     def command_space(self) -> CommandSpace:
         """What it can be told."""
         return self.config.command_space
+
+    @property
+    def supports(self) -> Supports:
+        """All of its command space, in the postures in which it walks while it does."""
+        bounds = Bounds(*self.command_space.bounds())
+        still = Bounds(bounds.lower.clone(), bounds.upper.clone())
+        still.lower[VELOCITY], still.upper[VELOCITY] = 0.0, 0.0
+        lowest, highest = torch.tensor(WALKING_POSTURE).unbind(-1)
+        posture = Bounds(bounds.lower.clone(), bounds.upper.clone())
+        posture.lower[POSTURE], posture.upper[POSTURE] = lowest, highest
+        return Supports(still, bounds & posture)
 
     @property
     def experts(self) -> int:
