@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import tyro
 
+from evaluation.baselines.onnx_policy import load_controller
 from evaluation.protocols import tracking
 from evaluation.protocols.arena import BATCH, Arena, batch_steps
 from evaluation.protocols.skills import BARS, FLAT, SKILLS, UNLOADED_BEND, run_skills, skill_episodes
@@ -35,7 +36,7 @@ from evaluation.protocols.tracking import (
     tracking_figures,
     walking_episodes,
 )
-from evaluation.reporting.plots import plot_bars, plot_curves, plot_heat_map
+from evaluation.reporting.plots import plot_bars, plot_curves, plot_heat_map, plot_scatter
 from evaluation.reporting.reports import (
     METRICS_FILE,
     REPORT_FILE,
@@ -48,7 +49,8 @@ from evaluation.reporting.reports import (
     write_results,
 )
 from evaluation.reporting.statistics import Figure
-from lowlevel.control.controller import Controller, add_metrics, content_hash
+from lowlevel.control.controller import Controller, add_metrics
+from lowlevel.control.whole_body import WholeBodyController
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.progress import ProgressReport
 from lowlevel.world.measures import TRACKING_FIGURES
@@ -68,9 +70,10 @@ class Arguments:
     """Measure the tracking errors of a frozen controller."""
 
     controller: Path
-    """Controller folder."""
+    """Controller folder, or the ONNX file of somebody else's policy that has a card (docs/compare.md)."""
     against: tuple[Path, ...] = ()
-    """Folders of controllers to compare with: same commands, same seeds, differences episode by episode."""
+    """Controllers to compare with: same seeds, the same commands, which all of them support, and differences episode by
+    episode."""
     suite: str = "simple"
     """Terrain: simple (flat and slabs that differ by ±2 cm, half of the episodes each), flat, or slabs."""
     condition: str = "nominal"
@@ -98,6 +101,16 @@ class Arguments:
 
 
 @dataclass(frozen=True)
+class Measured:
+    """What one controller did."""
+
+    figures: dict[str, Figure]
+    table: CommandTable
+    transient: np.ndarray
+    """Mean errors over the time since a command began (steps, figures)."""
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """Everything a report shows."""
 
@@ -105,13 +118,10 @@ class Evaluation:
     condition: str
     seed: int
     controller: str
-    """Content hash."""
-    figures: dict[str, Figure]
-    table: CommandTable
-    transient: np.ndarray
-    """Mean errors over the time since a command began (steps, figures)."""
-    differences: dict[str, dict[str, Figure]]
-    """Ours minus the other's, by content hash of the other controller and by figure."""
+    """Content hash, or the name on its card."""
+    ours: Measured
+    others: dict[str, Measured]
+    """What the other controllers did, by hash or name."""
     modes: tuple[str, ...]
     activations: np.ndarray
     """(modes, experts)"""
@@ -142,12 +152,14 @@ def _run(arguments: Arguments) -> None:
     if arguments.write_metrics and arguments.condition != "nominal":
         raise PilotError("--write-metrics is for figures under the nominal condition: leave one of the two out")
     check_output(arguments.output)
-    controller = Controller.load(arguments.controller)
-    others = {content_hash(folder): Controller.load(folder) for folder in arguments.against}
+    name, controller = load_controller(arguments.controller)
+    if arguments.write_metrics and not isinstance(controller, Controller):
+        raise PilotError(f"--write-metrics stores figures in a controller's folder, and {arguments.controller} is none")
+    others = dict(load_controller(path) for path in arguments.against)
     # Small matrix products only lose time to waking threads, and the physics wants the cores.
     torch.set_num_threads(1)
     print(f"evaluating {arguments.controller} on the {arguments.suite} suite", flush=True)
-    evaluation = evaluate(controller, content_hash(arguments.controller), arguments, others)
+    evaluation = evaluate(controller, name, arguments, others)
 
     def write(folder: Path) -> None:
         write_report(folder, evaluation)
@@ -155,9 +167,9 @@ def _run(arguments: Arguments) -> None:
             _record(controller, arguments, folder)
 
     write_results(arguments.output, write)
-    if arguments.write_metrics:
+    if arguments.write_metrics and isinstance(controller, Controller):
         stored = controller.provenance.get("metrics", {})
-        figures = {name: asdict(figure) for name, figure in evaluation.figures.items()}
+        figures = {name: asdict(figure) for name, figure in evaluation.ours.figures.items()}
         entry = {"seed": arguments.seed, "figures": figures}
         add_metrics(arguments.controller, stored | {arguments.suite: entry})
     print(summary(evaluation))
@@ -165,53 +177,58 @@ def _run(arguments: Arguments) -> None:
 
 
 def evaluate(
-    controller: Controller, identity: str, arguments: Arguments, others: Mapping[str, Controller]
+    controller: WholeBodyController, name: str, arguments: Arguments, others: Mapping[str, WholeBodyController]
 ) -> Evaluation:
-    """Run the protocol, the walking test, the motion modes and the skill tests, and the protocol with ``others``."""
+    """Run the protocol, the walking test and the skill tests with all controllers, the motion modes with the first."""
     began = time.monotonic()
     terrain = suite_terrain(arguments.suite)
-    space, tiles, seed = controller.command_space, len(terrain.tiles), arguments.seed
     conditions = conditions_of(arguments.condition)
+    supports = controller.supports
+    for other in others.values():
+        supports = supports & other.supports
 
-    def arena_of(tested: Controller, tiles: TerrainConfig) -> Arena:
-        return Arena(tested, tiles, conditions, num_threads=arguments.threads, batch=arguments.robots)
+    def arena_of(tested: WholeBodyController, tiles: TerrainConfig) -> Arena:
+        return Arena(
+            tested, tiles, conditions, num_threads=arguments.threads, batch=arguments.robots, supports=supports
+        )
 
     arena = arena_of(controller, terrain)
+    space, tiles, seed = arena.space, len(terrain.tiles), arguments.seed
     protocol = protocol_episodes(space, arguments.episodes, seed, tiles)
     walks = walking_episodes(space, arguments.walk_episodes, seed, tiles)
-    modes = mode_episodes(space, seed)
+    modes = mode_episodes(space, seed) if arena.experts else []
     skills = {skill.name: skill_episodes(skill, space, arguments.skill_episodes, seed) for skill in SKILLS}
     with ProgressReport() as progress:
-        batches = (*[protocol] * (1 + len(others)), walks, modes, *skills.values())
+        batches = (*[protocol, walks, *skills.values()] * (1 + len(others)), modes)
         total = sum(batch_steps(arena, episodes) for episodes in batches)
         task = progress.add_task("tracking", total=total)
 
         def advance(steps: int) -> None:
             progress.update(task, advance=steps)
 
-        table, transient = run_tracking(arena, protocol, advance)
-        differences = {}
-        for name, other in others.items():
-            progress.update(task, description=f"tracking of {name}")
-            differences[name] = paired_differences(table, run_tracking(arena_of(other, terrain), protocol, advance)[0])
-        progress.update(task, description="walking")
-        walking = run_walking(arena, walks, advance)
+        def measure(tested: WholeBodyController, whose: str) -> Measured:
+            arena = arena_of(tested, terrain)
+            progress.update(task, description=f"tracking{whose}")
+            table, transient = run_tracking(arena, protocol, advance)
+            progress.update(task, description=f"walking{whose}")
+            figures = tracking_figures(table, terrain.tiles) | run_walking(arena, walks, advance)
+            if arguments.skill_episodes:
+                progress.update(task, description=f"skills{whose}")
+                figures |= run_skills(arena_of(tested, FLAT), skills, advance)
+            return Measured(figures, table, transient)
+
+        ours = measure(controller, "")
+        measured = {other: measure(tested, f" of {other}") for other, tested in others.items()}
         progress.update(task, description="experts")
-        activations = run_modes(arena, modes, advance)
-        figures = tracking_figures(table, terrain.tiles) | walking
-        if arguments.skill_episodes:
-            progress.update(task, description="skills")
-            figures |= run_skills(arena_of(controller, FLAT), skills, advance)
+        activations = run_modes(arena, modes, advance) if modes else np.zeros((0, 0))
     return Evaluation(
         suite=arguments.suite,
         condition=arguments.condition,
         seed=seed,
-        controller=identity,
-        figures=figures,
-        table=table,
-        transient=transient,
-        differences=differences,
-        modes=tuple(motion_modes(space)),
+        controller=name,
+        ours=ours,
+        others=measured,
+        modes=tuple(motion_modes(space)) if modes else (),
         activations=activations,
         tiles=terrain.tiles,
         period=arena.period,
@@ -219,14 +236,13 @@ def evaluate(
     )
 
 
-def _record(controller: Controller, arguments: Arguments, folder: Path) -> None:
+def _record(controller: WholeBodyController, arguments: Arguments, folder: Path) -> None:
     from evaluation.pictures.recording import record_episodes  # the viewer's library is large and seldom needed here
 
     terrain = suite_terrain(arguments.suite)
     conditions = conditions_of(arguments.condition)
     arena = Arena(controller, terrain, conditions, num_threads=arguments.threads, batch=arguments.robots)
-    space = controller.command_space
-    episodes = protocol_episodes(space, arguments.record, arguments.seed, len(terrain.tiles))
+    episodes = protocol_episodes(arena.space, arguments.record, arguments.seed, len(terrain.tiles))
     record_episodes(arena, episodes, folder)
 
 
@@ -235,23 +251,22 @@ def _record(controller: Controller, arguments: Arguments, folder: Path) -> None:
 
 def write_report(folder: Path, evaluation: Evaluation) -> None:
     """Write ``report.md``, plots and ``metrics.json`` into ``folder``."""
-    figures, paper = evaluation.figures, PAPER[evaluation.suite]
+    figures, paper = evaluation.ours.figures, PAPER[evaluation.suite]
     cases = {"all": "", "steady": "_steady", **{group: f"_{group}" for group in GROUPS}}
     panels = {name: {label: figures[name + suffix] for label, suffix in cases.items()} for name in TRACKING_FIGURES}
     panels["fall_rate"] = {label: figures["fall_rate" + suffix] for label, suffix in cases.items() if label != "steady"}
-    evaluation.table.write(folder / EPISODES_FILE, evaluation.tiles)
+    evaluation.ours.table.write(folder / EPISODES_FILE, evaluation.tiles)
     plot_bars(folder / "tracking.png", panels, paper, columns=3)
-    steps = np.arange(1, len(evaluation.transient) + 1) * evaluation.period
+    steps = np.arange(1, len(evaluation.ours.transient) + 1) * evaluation.period
     titles = [f"{name} [{unit}]" for name, (unit, _) in TRACKING_FIGURES.items()]
-    plot_curves(
-        folder / "transient.png",
-        steps,
-        evaluation.transient,
-        titles,
-        "time since the command changed [s]",
-    )
-    experts = [f"expert {number}" for number in range(1, evaluation.activations.shape[1] + 1)]
-    plot_heat_map(folder / "experts.png", evaluation.activations, evaluation.modes, experts, "mean expert activation")
+    since = "time since the command changed [s]"
+    plot_curves(folder / "transient.png", steps, evaluation.ours.transient, titles, since)
+    if evaluation.modes:
+        experts = [f"expert {number}" for number in range(1, evaluation.activations.shape[1] + 1)]
+        heat = "mean expert activation"
+        plot_heat_map(folder / "experts.png", evaluation.activations, evaluation.modes, experts, heat)
+    if evaluation.others:
+        plot_scatter(folder / "comparison.png", _paired_episodes(evaluation))
     (folder / REPORT_FILE).write_text(report_text(evaluation))
     activations = {
         mode: [None if np.isnan(value) else float(value) for value in row]
@@ -266,10 +281,8 @@ def write_report(folder: Path, evaluation: Evaluation) -> None:
             suite=evaluation.suite,
             condition=evaluation.condition,
             expert_activations=activations,
-            differences={
-                other: {name: asdict(figure) for name, figure in rows.items()}
-                for other, rows in evaluation.differences.items()
-            },
+            others={name: _plain(other.figures) for name, other in evaluation.others.items()},
+            differences={name: _plain(rows) for name, rows in _differences(evaluation).items()},
             seconds=round(evaluation.seconds, 1),
         ),
     )
@@ -277,23 +290,22 @@ def write_report(folder: Path, evaluation: Evaluation) -> None:
 
 def summary(evaluation: Evaluation) -> str:
     """The headline figures in one line."""
-    values = [
-        f"{name} {format_figure(evaluation.figures[name]).split(' ')[0]}" for name in (*TRACKING_FIGURES, "fall_rate")
-    ]
-    return "  ".join(values)
+    figures = evaluation.ours.figures
+    names = (*TRACKING_FIGURES, "fall_rate")
+    return "  ".join(f"{name} {format_figure(figures[name]).split(' ')[0]}" for name in names)
 
 
 def report_text(evaluation: Evaluation) -> str:
     """``report.md``."""
-    figures, groups = evaluation.figures, {group: f"_{group}" for group in GROUPS}
+    figures, groups = evaluation.ours.figures, {group: f"_{group}" for group in GROUPS}
     has_skills = "deep_bend_success" in figures
     return render(
         "tracking",
-        **{name: getattr(evaluation, name) for name in ("suite", "condition", "seed", "controller", "tiles")},
+        **{name: getattr(evaluation, name) for name in ("suite", "condition", "seed", "controller", "tiles", "modes")},
         protocol=tracking,
         figures=figures,
         paper=PAPER[evaluation.suite],
-        differences=_comparison(evaluation.differences),
+        comparison=_comparison(evaluation) if evaluation.others else "",
         by_group=_breakdown(figures, groups),
         by_group_steady=_breakdown(figures, groups, "_steady"),
         by_tile=_breakdown(figures, {tile: f"_on_{tile}" for tile in evaluation.tiles}),
@@ -302,13 +314,43 @@ def report_text(evaluation: Evaluation) -> str:
     )
 
 
-def _comparison(differences: Mapping[str, Mapping[str, Figure]]) -> str:
-    """The table of other controllers; empty without any."""
-    if not differences:
-        return ""
-    names = list(next(iter(differences.values())))
-    rows = [[name, *(format_figure(figures[name]) for figures in differences.values())] for name in names]
-    return markdown_table(["figure", *(f"against `{name}`" for name in differences)], rows)
+UNPAIRED = ("fall_rate", "energy_per_meter", "fast_walk_speed", "fast_walk_success", "stop_success", "push_success")
+"""Figures that controllers are compared by, but not episode by episode."""
+
+
+def _differences(evaluation: Evaluation) -> dict[str, dict[str, Figure]]:
+    """Ours minus theirs, by controller and figure."""
+    ours = evaluation.ours.table
+    return {name: paired_differences(ours, other.table) for name, other in evaluation.others.items()}
+
+
+def _paired_episodes(evaluation: Evaluation) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Errors of the same episodes, ours and theirs, by figure and controller."""
+    ours = evaluation.ours.table
+    return {
+        name: {
+            other: (ours.by_episode(name), measured.table.by_episode(name))
+            for other, measured in evaluation.others.items()
+        }
+        for name in FIGURES
+        if name != "E_stumble"
+    }
+
+
+def _comparison(evaluation: Evaluation) -> str:
+    """The table of all controllers."""
+    columns = {"ours": evaluation.ours, **evaluation.others}
+    differences = _differences(evaluation)
+    rows = []
+    for name in (*FIGURES, *UNPAIRED):
+        values = [format_figure(m.figures[name]) if name in m.figures else "–" for m in columns.values()]
+        paired = [format_figure(rows[name]) if name in rows else "–" for rows in differences.values()]
+        rows.append([name, *values, *paired])
+    return markdown_table(["figure", *columns, *(f"ours - {name}" for name in differences)], rows)
+
+
+def _plain(figures: Mapping[str, Figure]) -> dict[str, dict[str, object]]:
+    return {name: asdict(figure) for name, figure in figures.items()}
 
 
 def _breakdown(figures: Mapping[str, Figure], columns: Mapping[str, str], suffix: str = "") -> str:

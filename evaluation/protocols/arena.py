@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lowlevel.commands import COMMAND_SIZE, clamp_posture
+from lowlevel.commands import COMMAND_SIZE, clamp_posture, command_space
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import MAP_REFRESH_STEPS, NoiseConfig
-from lowlevel.control.whole_body import HasExperts, WholeBodyController
+from lowlevel.control.whole_body import HasExperts, Supports, WholeBodyController
 from lowlevel.world.measures import Measurement
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
 from lowlevel.world.terrain import TerrainConfig
@@ -68,7 +68,7 @@ class Episode:
     starts: tuple[float, ...]
     """When each command begins [s], ascending, the first at 0."""
     commands: Tensor
-    """(len(starts), 21); clamped to what the robot can hold, the same for every controller."""
+    """(len(starts), 21); cut to what the controllers support, and clamped to what the robot can hold."""
     flags: Tensor
     """Tracking flag I of each command (len(starts),)."""
     tile: int = 0
@@ -145,6 +145,7 @@ class Arena:
         noise: observation noise.
         num_threads: physics threads.
         batch: robots simulated side by side (N).
+        supports: what commands are cut to; by default what the controller can be told.
     """
 
     def __init__(
@@ -155,12 +156,17 @@ class Arena:
         noise: NoiseConfig = NoiseConfig(),  # noqa: B008 (frozen)
         num_threads: int = 2,
         batch: int = BATCH,
+        supports: Supports | None = None,
     ) -> None:
         self.controller = controller
         self.batch = batch
         self.world = World(ModelOptions(gains=controller.gains), terrain, batch, num_threads)
         self.simulation = self.world.simulation
         self.period = self.simulation.control_period
+        lower, upper = self.simulation.joint_lower, self.simulation.joint_upper
+        self.space = command_space(lower.tolist(), upper.tolist())
+        self.supports = controller.supports if supports is None else supports
+        self._neutral = self.supports.cut(self.space.neutral()[None])
         self.experts = controller.experts if isinstance(controller, HasExperts) else 0
         drawn = RandomizationConfig.for_evaluation() if conditions is None else conditions
         self._randomizer = Randomizer(drawn, self.simulation, torch.Generator())
@@ -253,14 +259,14 @@ class Arena:
         most = max(len(episode.starts) for episode in episodes)
         starts = torch.full((self.batch, most), torch.iinfo(torch.long).max)
         starts[:, 0] = 0
-        commands = self.controller.command_space.neutral().repeat(self.batch, most, 1)
+        commands = self._neutral.repeat(self.batch, most, 1)
         flags = torch.ones(self.batch, most, 1)
         for row, episode in enumerate(episodes):
             count = len(episode.starts)
             starts[row, :count] = torch.tensor([self._steps(start) for start in episode.starts])
             commands[row, :count] = episode.commands
             flags[row, :count, 0] = episode.flags
-        clamped = clamp_posture(commands.flatten(0, 1), self.world.pose)
+        clamped = clamp_posture(self.supports.cut(commands.flatten(0, 1)), self.world.pose)
         return starts, clamped.reshape(self.batch, most, COMMAND_SIZE), flags
 
     def _pushes(self, episodes: Sequence[Episode]) -> dict[int, Tensor]:
@@ -319,7 +325,7 @@ class Arena:
 
     def _stand(self, ids: Tensor, xy: Tensor, heading: Tensor, joint_spread: Tensor) -> None:
         """Put robots ``ids`` (n,) at rest in the nominal pose of the neutral command, feet just above the ground."""
-        neutral = self.controller.command_space.neutral().repeat(len(ids), 1)
+        neutral = self._neutral.repeat(len(ids), 1)
         self.simulation.restart(ids)
         joints = self.world.stand(ids, xy, heading, neutral, joint_spread)
         self._randomizer.start(ids, joints)

@@ -43,6 +43,25 @@ def plot_bars(
     _save(canvas, path)
 
 
+def plot_scatter(
+    path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], columns: int = 4
+) -> None:
+    """One panel per quantity, in it one point per episode: ours across, of each other controller upwards."""
+    rows = -(-len(panels) // columns)
+    canvas, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 3.2 * rows), squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis, (title, cases) in zip(axes.flat, panels.items(), strict=False):
+        for label, (ours, theirs) in cases.items():
+            axis.scatter(ours, theirs, s=6, alpha=0.5, label=label)
+        largest = np.nanmax([0.0, *(np.nanmax(values, initial=0.0) for pair in cases.values() for values in pair)])
+        axis.plot([0.0, largest], [0.0, largest], color="black", linewidth=1)
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("ours", fontsize=8)
+    axes.flat[0].legend(fontsize=8)
+    _save(canvas, path)
+
+
 def plot_curves(
     path: Path,
     time: np.ndarray,

@@ -36,8 +36,8 @@ from lowlevel.control.observation import (
 )
 from lowlevel.control.onnx_step import OnnxStep, export_step
 from lowlevel.control.reference import Reference, ReferenceConfig
-from lowlevel.networks.actor import NetworkConfig, ObservationSizes, PilotActor
 from lowlevel.control.whole_body import Bounds, Supports
+from lowlevel.networks.actor import NetworkConfig, ObservationSizes, PilotActor
 from lowlevel.runs.configs import from_plain
 from lowlevel.runs.files import atomic_write
 from lowlevel.runs.frozen_folder import FrozenFolder

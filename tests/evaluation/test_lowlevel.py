@@ -264,6 +264,7 @@ def test_command_writes_a_report(
         "tracking.png",
         "transient.png",
         "experts.png",
+        "comparison.png",
         "episode_0.rrd",
     }
     content = json.loads((output / "metrics.json").read_text())
@@ -276,9 +277,12 @@ def test_command_writes_a_report(
     assert content["figures"]["push_success"]["n"] == 1
     (difference,) = content["differences"].values()
     assert difference["E_v"]["value"] == 0.0
+    (other,) = content["others"].values()
+    assert other["E_v"] == content["figures"]["E_v"] and other["push_success"]["n"] == 1
     rows = (output / "episodes.csv").read_text().splitlines()
     assert len(rows) == 1 + 2 * 2 and rows[0].startswith("episode,tile,group,E_v,")
     text = (output / "report.md").read_text()
+    assert "## Against other controllers" in text and "| figure | ours | " in text
     assert "## Skills" in text and "- deep_bend: bend to height" in text and "unloaded_bend" not in text
     assert "| push_success | 1 |" in text and "| ≥ 0.90 |" in text
     assert "0.145" in text, "the paper's figure stands beside ours"

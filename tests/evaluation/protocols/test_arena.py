@@ -24,6 +24,7 @@ from evaluation.protocols.arena import (
 from lowlevel.commands import ARMS, HEIGHT, VELOCITY, command_space
 from lowlevel.control.controller import Controller
 from lowlevel.control.observation import NoiseConfig
+from lowlevel.control.whole_body import Bounds, Supports
 from lowlevel.world.randomization import RandomizationConfig
 from lowlevel.world.terrain import TerrainConfig
 from robots.g1.constants import FOOT_BODIES, HAND_BODIES, NUM_JOINTS, gain_set
@@ -204,21 +205,22 @@ class Statue:
     def __init__(self, fails: Sequence[int] = ()) -> None:
         self.fails = list(fails)
         limits = joint_limits(build_spec().compile())
-        self.command_space = command_space(limits[:, 0].tolist(), limits[:, 1].tolist())
+        self.neutral = command_space(limits[:, 0].tolist(), limits[:, 1].tolist()).neutral()
+        self.supports = Supports(Bounds(self.neutral, self.neutral), Bounds(self.neutral, self.neutral))
 
     def reset(self, num_robots: int, ids: torch.Tensor | None = None) -> None:
         """It remembers nothing."""
 
     def act(self, *measured: object) -> torch.Tensor:
         stands = NominalPose.load().lookup(torch.tensor([[0.76, 0.0, 0.0, 0.0]])).position
-        targets = torch.cat([stands, self.command_space.neutral()[None, ARMS]], dim=1).repeat(2, 1)
+        targets = torch.cat([stands, self.neutral[None, ARMS]], dim=1).repeat(2, 1)
         targets[self.fails] = torch.nan
         return targets
 
 
 def test_any_controller_can_be_run() -> None:
     arena = Arena(Statue(), FLAT, num_threads=1, batch=2)
-    episodes = [constant(seed, 1.0, Statue().command_space.neutral(), flag=1.0) for seed in range(2)]
+    episodes = [constant(seed, 1.0, arena.space.neutral(), flag=1.0) for seed in range(2)]
     moments = list(arena.run(episodes))
     assert len(moments) == 50 and moments[-1].active.all()
     assert moments[-1].gate.shape == (2, arena.experts) == (2, 0)
