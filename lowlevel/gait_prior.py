@@ -37,7 +37,7 @@ _ROWS: tuple[dict[str, float], ...] = (
 class GaitPriorConfig:
     """Size of the prior's rows."""
 
-    lift: float = 0.9
+    lift: float = 1.2
     """Knee flexion at mid-swing [rad]."""
     shift: float = 0.06
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
