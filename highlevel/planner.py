@@ -37,7 +37,6 @@ _FOLDER = FrozenFolder(
     version=FORMAT_VERSION,
     description_file=PLANNER_FILE,
     weights_file=WEIGHTS_FILE,
-    identity_file=WEIGHTS_FILE,
     example="checkpoints/highlevel",
     error=PlannerError,
 )
@@ -136,5 +135,5 @@ class Planner:
 
 
 def planner_hash(folder: Path | str) -> str:
-    """Identity of a planner: SHA-256 over configuration and weights, 16 hexadecimal digits."""
+    """Identity of a planner: SHA-256 over all of its folder but the provenance, 16 hexadecimal digits."""
     return _FOLDER.identity(Path(folder))

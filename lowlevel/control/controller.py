@@ -63,7 +63,7 @@ _FOLDER = FrozenFolder(
     version=FORMAT_VERSION,
     description_file=CONFIG_FILE,
     weights_file=WEIGHTS_FILE,
-    identity_file=ONNX_FILE,
+    other_files=(ONNX_FILE, GOLDEN_FILE),
     example="checkpoints/lowlevel",
     error=ControllerError,
 )
@@ -324,7 +324,7 @@ def observation_layout() -> list[dict[str, Any]]:
 
 
 def content_hash(folder: Path | str) -> str:
-    """Identity of a controller: SHA-256 over configuration and ONNX file, 16 hexadecimal digits."""
+    """Identity of a controller: SHA-256 over all of its folder but the provenance, 16 hexadecimal digits."""
     return _FOLDER.identity(Path(folder))
 
 

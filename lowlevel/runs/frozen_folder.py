@@ -33,8 +33,8 @@ class FrozenFolder:
     example: str
     """Where folders of this kind are found."""
     error: type[PilotError]
-    identity_file: str
-    """The file that makes out the identity together with the configuration."""
+    other_files: tuple[str, ...] = ()
+    """Files beside description and weights."""
 
     def read_description(self, folder: Path) -> dict[str, Any]:
         """Contents of the description, of whatever version."""
@@ -100,10 +100,13 @@ class FrozenFolder:
         self._write(folder, description | {"provenance": description["provenance"] | entries})
 
     def identity(self, folder: Path) -> str:
-        """SHA-256 over configuration and :attr:`identity_file`, 16 hexadecimal digits."""
-        digest = hashlib.sha256()
-        digest.update(json.dumps(self.read_description(folder)["config"], sort_keys=True).encode())
-        digest.update((folder / self.identity_file).read_bytes())
+        """SHA-256 over all that the folder holds but the provenance, 16 hexadecimal digits."""
+        description = self.read_description(folder)
+        description.pop("provenance", None)
+        digest = hashlib.sha256(json.dumps(description, sort_keys=True).encode())
+        for name in (self.weights_file, *self.other_files):
+            if (folder / name).is_file():
+                digest.update(name.encode() + (folder / name).read_bytes())
         return digest.hexdigest()[:16]
 
     def _write(self, folder: Path, description: dict[str, Any]) -> None:

@@ -155,6 +155,19 @@ def test_metrics_do_not_change_the_identity(folder: Path, tmp_path: Path) -> Non
     assert Controller.load(copy).provenance["metrics"] == {"E_v": 0.1}
 
 
+def test_the_identity_covers_every_file(folder: Path, tmp_path: Path) -> None:
+    identities = {content_hash(folder)}
+    for number, file in enumerate(sorted(folder.iterdir())):
+        copy = Path(shutil.copytree(folder, tmp_path / str(number)))
+        if file.suffix == ".json":
+            content = json.loads(file.read_text())
+            (copy / file.name).write_text(json.dumps(content | {"more": 1}))
+        else:
+            (copy / file.name).write_bytes(file.read_bytes() + b" ")
+        identities.add(content_hash(copy))
+    assert len(identities) == 1 + len(list(folder.iterdir())) == 5
+
+
 @pytest.fixture
 def copy(folder: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "copy"))
