@@ -7,8 +7,10 @@ terrain of a stage (:mod:`lowlevel.presets`) and in ``evaluation.protocols.track
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -20,17 +22,36 @@ from robots.errors import PilotError
 from robots.g1.model import WORLD_COLLISION
 from robots.rotations import rotate_about_vertical
 
+MARGIN = 0.5
+"""Flat ground around what stands on a tile [m]."""
 STANCE_REACH = 0.3
 """No part of a standing robot's soles is farther than this from the base, horizontally and along each axis [m]."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """An axis-aligned box standing on the ground plane: center (x, y), half extents (x, y), top height [m]."""
+    """A box that stands on the ground plane, or a frustum: a box whose top face is smaller than its base."""
 
     center: tuple[float, float]
+    """[m]"""
     half_extent: tuple[float, float]
+    """Of its base along x and y [m]."""
     top: float
+    """Height of its top face [m]."""
+    half_top: tuple[float, float] | None = None
+    """Half extent of its top face; as large as the base by default [m]."""
+
+    def moved(self, x: float, y: float) -> Block:
+        """The same block somewhere else."""
+        return replace(self, center=(self.center[0] + x, self.center[1] + y))
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Height of its surface at points of its base."""
+        if self.half_top is None:
+            return np.full(np.broadcast_shapes(x.shape, y.shape), self.top)
+        apart = (np.abs(x - self.center[0]), np.abs(y - self.center[1]))
+        rises = [(b - d) / (b - t) for b, d, t in zip(self.half_extent, apart, self.half_top, strict=True)]
+        return self.top * np.clip(np.minimum(*rises), 0.0, 1.0)
 
 
 def flat(size: float, level: float, rng: np.random.Generator) -> list[Block]:
@@ -51,8 +72,43 @@ def irregular(size: float, level: float, rng: np.random.Generator) -> list[Block
     ]
 
 
+def rough(size: float, level: float, rng: np.random.Generator) -> list[Block]:
+    """Steps of up to +-6 cm at level 1 every 0.4 m, both ways.
+
+    The ground is the higher one of two crossing strips: a tenth of the blocks that as many slabs would take.
+    """
+    half, strip = size / 2.0, 0.4
+    count = round(size / strip)
+    centers = (np.arange(count) + 0.5) * strip - half
+    tops = 0.002 + 0.12 * level * rng.random((2, count))
+    along = [Block((float(x), 0.0), (strip / 2, half), float(top)) for x, top in zip(centers, tops[0], strict=True)]
+    across = [Block((0.0, float(y)), (half, strip / 2), float(top)) for y, top in zip(centers, tops[1], strict=True)]
+    return along + across
+
+
+def slope(size: float, level: float, rng: np.random.Generator) -> list[Block]:
+    """Slopes of 2 degrees at level 0 to 20 degrees at level 1, up to a landing of 2 m in the middle."""
+    base, landing = size / 2.0 - MARGIN, 1.0
+    height = (base - landing) * math.tan(math.radians(2.0 + 18.0 * level))
+    return [Block((0.0, 0.0), (base, base), height, (landing, landing))]
+
+
+def stairs(size: float, level: float, rng: np.random.Generator) -> list[Block]:
+    """Stairs up to a landing of 2 m in the middle: risers of 5 to 20 cm, by their level, and treads of 25 to 35 cm."""
+    riser, tread, landing = 0.05 + 0.15 * level, float(rng.choice([0.25, 0.3, 0.35])), 1.0
+    count = int((size / 2.0 - MARGIN - landing) / tread)
+    return [Block((0.0, 0.0), (landing + (count - step) * tread,) * 2, (step + 1) * riser) for step in range(count + 1)]
+
+
+def platform(size: float, level: float, rng: np.random.Generator) -> list[Block]:
+    """Blocks of 0.5 m across the tile, to step onto and off: 10 cm high at level 0, 30 cm at level 1."""
+    length = size / 2.0 - MARGIN
+    return [Block((x, 0.0), (0.25, length), 0.1 + 0.2 * level) for x in (-2.0, 0.0, 2.0)]
+
+
 TileFunction = Callable[[float, float, np.random.Generator], list[Block]]
-TILES: dict[str, TileFunction] = {"flat": flat, "irregular": irregular}
+TILES: dict[str, TileFunction] = {tile.__name__: tile for tile in (flat, irregular, rough, slope, stairs, platform)}
+"""Kinds of tile by name. A tile is blocks around its own center; the terrain places them."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +117,10 @@ class TerrainConfig:
 
     tiles: tuple[str, ...] = ("flat",)
     """Kinds of tile, in a row along y; each is a key of :data:`TILES`."""
+    levels: tuple[float, ...] = (1.0,)
+    """Difficulties in [0, 1] in which there is one tile of each kind, along x."""
     tile_size: float = 8.0
     """Side of a square tile [m]."""
-    level: float = 1.0
-    """Difficulty in [0, 1], handed to the tile functions."""
     raster_resolution: float = 0.05
     """Cell size of the height raster [m]."""
     seed: int = 0
@@ -72,7 +128,10 @@ class TerrainConfig:
 
 
 class Terrain:
-    """Blocks, the height raster built from them, and lookups on it."""
+    """Blocks, the height raster built from them, and lookups on it.
+
+    ``tile_centers`` (tiles, 2) [m]: those of the first kind first, from the first level to the last.
+    """
 
     def __init__(self, config: TerrainConfig, device: torch.device | str = "cpu") -> None:
         unknown = [tile for tile in config.tiles if tile not in TILES]
@@ -81,41 +140,50 @@ class Terrain:
         self.config = config
         rng = np.random.default_rng(config.seed)
         size = config.tile_size
-        centers = [(0.0, (i - (len(config.tiles) - 1) / 2.0) * size) for i in range(len(config.tiles))]
-        self.blocks = [
-            Block((cx + block.center[0], cy + block.center[1]), block.half_extent, block.top)
-            for tile, (cx, cy) in zip(config.tiles, centers, strict=True)
-            for block in TILES[tile](size, config.level, rng)
-        ]
+        extent = np.array([len(config.levels), len(config.tiles)]) * size
+        self._origin = torch.tensor(-extent / 2.0, dtype=torch.float32, device=device)
+        centers, self.blocks = [], []
+        for (row, tile), (column, level) in itertools.product(enumerate(config.tiles), enumerate(config.levels)):
+            x, y = (np.array([column, row]) + 0.5) * size - extent / 2.0
+            centers.append((float(x), float(y)))
+            self.blocks += [block.moved(float(x), float(y)) for block in TILES[tile](size, level, rng)]
         self.tile_centers = torch.tensor(centers, dtype=torch.float32, device=device)
-        self._origin = torch.tensor([-size / 2, -size * len(config.tiles) / 2], device=device)
         # The outermost cells stand for the plane around the tiles.
-        self._raster = torch.from_numpy(np.pad(self._rasterize(), 1)).to(device)
+        self._raster = torch.from_numpy(np.pad(self._rasterize(extent), 1)).to(device)
         self._map_offsets = map_points(device)
 
-    def _rasterize(self) -> np.ndarray:
-        config, resolution = self.config, self.config.raster_resolution
-        shape = (
-            round(config.tile_size / resolution),
-            round(config.tile_size * len(config.tiles) / resolution),
-        )
-        raster = np.zeros(shape, dtype=np.float32)
-        origin = self._origin.cpu().numpy()
+    def _rasterize(self, extent: np.ndarray) -> np.ndarray:
+        """The highest surface at the center of every cell."""
+        resolution = self.config.raster_resolution
+        raster = np.zeros(np.round(extent / resolution).astype(int), dtype=np.float32)
         for block in self.blocks:
-            low = (np.array(block.center) - block.half_extent - origin) / resolution
-            high = (np.array(block.center) + block.half_extent - origin) / resolution
-            (i0, j0), (i1, j1) = np.round(low).astype(int), np.round(high).astype(int)
-            cells = raster[max(i0, 0) : i1, max(j0, 0) : j1]
-            np.maximum(cells, block.top, out=cells)
+            low = (np.array(block.center) - block.half_extent + extent / 2.0) / resolution
+            high = (np.array(block.center) + block.half_extent + extent / 2.0) / resolution
+            (i0, j0), (i1, j1) = np.maximum(np.round(low).astype(int), 0), np.round(high).astype(int)
+            cells = raster[i0:i1, j0:j1]
+            x = (i0 + np.arange(cells.shape[0]) + 0.5) * resolution - extent[0] / 2.0
+            y = (j0 + np.arange(cells.shape[1]) + 0.5) * resolution - extent[1] / 2.0
+            heights = block.height(x[:, None], y[None])
+            np.maximum(cells, heights, out=cells, casting="same_kind")
         return raster
 
     def add_to(self, spec: mujoco.MjSpec, friction: float = 1.0) -> None:
-        """Add the blocks as static boxes that feet and objects collide with."""
+        """Add the blocks as static geoms that feet and objects collide with."""
         for number, block in enumerate(self.blocks):
-            geom = spec.worldbody.add_geom(name=f"terrain_{number}", type=mujoco.mjtGeom.mjGEOM_BOX)
-            half_height = 0.5 * block.top
-            geom.pos = [*block.center, half_height]
-            geom.size = [*block.half_extent, half_height]
+            geom = spec.worldbody.add_geom(name=f"terrain_{number}")
+            if block.half_top is None:
+                half_height = 0.5 * block.top
+                geom.type = mujoco.mjtGeom.mjGEOM_BOX
+                geom.pos, geom.size = [*block.center, half_height], [*block.half_extent, half_height]
+            else:
+                corners = [
+                    (sign_x * x, sign_y * y, z)
+                    for (x, y), z in ((block.half_extent, 0.0), (block.half_top, block.top))
+                    for sign_x, sign_y in itertools.product((-1, 1), repeat=2)
+                ]
+                spec.add_mesh(name=f"terrain_{number}", uservert=np.array(corners).flatten())
+                geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"terrain_{number}"
+                geom.pos = [*block.center, 0.0]
             geom.contype, geom.conaffinity = 0, WORLD_COLLISION
             geom.friction = [friction, 0.005, 0.0001]
             geom.rgba = [0.5, 0.52, 0.5, 1.0]

@@ -1,5 +1,7 @@
 """The height raster against MuJoCo's ray casting on the same blocks."""
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -24,15 +26,49 @@ def scene(terrain: Terrain) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
-def test_heights_agree_with_ray_casting(terrain: Terrain) -> None:
+@pytest.mark.parametrize("tile", TILES)
+def test_heights_agree_with_ray_casting(tile: str) -> None:
+    """Exactly in the middle of the raster's cells, and on slopes, which it has in steps, within 1 cm anywhere."""
+    terrain = Terrain(TerrainConfig(tiles=("flat", tile), levels=(0.0, 0.5, 1.0)))
     model, data = scene(terrain)
-    points = np.random.default_rng(0).uniform([-5, -9], [5, 9], (300, 2))
-    heights = terrain.height(torch.tensor(points, dtype=torch.float32)).numpy()
+    rng = np.random.default_rng(0)
+    anywhere = rng.uniform([-13, -9], [13, 9], (1500, 2))
+    middles = (np.floor(anywhere / 0.05) + 0.5) * 0.05
     geom = np.zeros(1, dtype=np.int32)
-    for point, height in zip(points, heights, strict=True):
-        start = np.array([*point, 2.0])
-        distance = mujoco.mj_ray(model, data, start, np.array([0, 0, -1.0]), None, 1, -1, geom, None)
-        assert 2.0 - distance == pytest.approx(height, abs=1e-6)
+
+    def errors(points: np.ndarray) -> np.ndarray:
+        heights = terrain.height(torch.tensor(points, dtype=torch.float32)).numpy()
+        rays = []
+        for point in points:
+            start = np.array([*point, 3.0])
+            rays.append(3.0 - mujoco.mj_ray(model, data, start, np.array([0, 0, -1.0]), None, 1, -1, geom, None))
+        return np.abs(heights - rays)
+
+    assert errors(middles).max() < 1e-5
+    if tile == "slope":
+        assert errors(anywhere).max() < 0.01
+    assert (terrain.height(torch.tensor(middles, dtype=torch.float32)) > 0.0).any() or tile == "flat"
+
+
+@pytest.mark.parametrize(("tile", "lowest", "highest"), [("stairs", 0.05, 0.2), ("platform", 0.1, 0.3)])
+def test_edges_are_as_high_as_the_level_says(tile: str, lowest: float, highest: float) -> None:
+    for level, edge in ((0.0, lowest), (0.5, 0.5 * (lowest + highest)), (1.0, highest)):
+        tops = sorted({0.0, *(block.top for block in TILES[tile](8.0, level, np.random.default_rng(3)))})
+        np.testing.assert_allclose(np.diff(tops), edge)
+
+
+def test_a_slope_rises_by_its_angle() -> None:
+    terrain = Terrain(TerrainConfig(tiles=("slope",), levels=(1.0,)))
+    low, high = terrain.height(torch.tensor([[-3.025, 0.025], [-1.525, 0.025]])).tolist()
+    assert math.degrees(math.atan((high - low) / 1.5)) == pytest.approx(20.0, abs=0.05)
+
+
+def test_tiles_lie_by_kind_and_level() -> None:
+    terrain = Terrain(TerrainConfig(tiles=("flat", "platform", "stairs"), levels=(0.0, 1.0)))
+    heights = terrain.height(terrain.tile_centers)
+    assert heights[:4].tolist() == pytest.approx([0.0, 0.0, 0.1, 0.3])
+    assert heights[5] > 3.0 * heights[4] > 1.0
+    assert torch.pdist(terrain.tile_centers).min() == pytest.approx(8.0)
 
 
 def test_the_highest_ground_is_that_of_the_slabs_within_reach(terrain: Terrain) -> None:
