@@ -18,6 +18,7 @@ TRACKING = RewardWeights(
     angular_velocity_fine=3.0,
     mean_linear_velocity=3.0,
     mean_angular_velocity=3.0,
+    capture_point=5.0,
     base_height=5.0,
     torso_orientation=8.0,
     upper_body_position=1.5,

@@ -41,6 +41,7 @@ class RewardWeights:
     velocity_progress: float = 0.0
     mean_linear_velocity: float = 0.0
     mean_angular_velocity: float = 0.0
+    capture_point: float = 0.0
     # Additions: the shape of a gait
     foot_phase: float = 0.0
     contact_schedule: float = 0.0
@@ -245,6 +246,14 @@ def mean_linear_velocity(t: Transition, width: float = 0.1) -> Tensor:
 def mean_angular_velocity(t: Transition, width: float = 0.15) -> Tensor:
     """Tracking of the yaw rate on average; ``width`` [rad/s]."""
     return laplace(t.mean_velocity_error[:, 2], width)
+
+
+def capture_point(t: Transition, width: float = 0.1) -> Tensor:
+    """Balance of a robot that stands: the capture point over the middle of the feet; ``width`` [m].
+
+    A robot that topples over feet at rest drifts for a second before anything else tells that it does.
+    """
+    return torch.where(t.walking, 1.0, laplace(t.measured.capture_point.norm(dim=-1), width))
 
 
 def vertical_velocity(t: Transition) -> Tensor:

@@ -26,11 +26,8 @@ from lowlevel.commands import (
     is_walking,
 )
 from robots.g1.arm_mass import ArmMass
-from robots.g1.constants import ARM_JOINTS, LOWER_JOINTS, Gains
+from robots.g1.constants import ARM_JOINTS, GRAVITY, LOWER_JOINTS, Gains
 from robots.g1.nominal_pose import NominalPose
-
-GRAVITY = 9.81
-"""[m/s^2]"""
 
 
 @dataclass(frozen=True)

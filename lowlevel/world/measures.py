@@ -13,7 +13,7 @@ from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.control.observation import Proprioception
 from lowlevel.world.simulation import RobotState
 from lowlevel.world.terrain import Terrain
-from robots.g1.constants import ARM_JOINTS, BODY_POINTS
+from robots.g1.constants import ARM_JOINTS, BODY_POINTS, GRAVITY
 from robots.rotations import (
     about_axis,
     conjugate,
@@ -46,6 +46,9 @@ class Measurement:
     """Pelvis above the ground under the lowest foot (N,) [m]."""
     torso_orientation: Tensor
     """Torso quaternion relative to the heading frame (N, 4)."""
+    capture_point: Tensor
+    """Where the robot would have to put a foot to come to rest, from the middle between its soles (N, 2) [m] (Pratt et
+    al., Humanoids 2006): the center of mass, and its velocity times the time constant of its fall."""
     foot_position: Tensor
     """Center of each sole from the pelvis (N, 2, 3) [m]."""
     foot_velocity: Tensor
@@ -76,6 +79,11 @@ def measure(robot: RobotState, terrain: Terrain) -> Measurement:
     ground = terrain.height(robot.foot_position[..., :2])
     lowest = robot.foot_position[..., 2].argmin(dim=1, keepdim=True)
     from_pelvis = robot.foot_position - robot.base_position[:, None]
+    middle = robot.foot_position.mean(dim=1)
+    fall_time = ((robot.center_of_mass[:, 2] - middle[:, 2]).clamp_min(0.1) / GRAVITY).sqrt()
+    capture_point = (
+        robot.center_of_mass[:, :2] + fall_time[:, None] * robot.center_of_mass_velocity[:, :2] - middle[:, :2]
+    )
     feet = torch.cat([from_pelvis, robot.foot_velocity, robot.foot_force], dim=1)
     position, velocity, force = rotate_about_vertical(-heading[:, None], feet).split(2, dim=1)
     return Measurement(
@@ -86,6 +94,7 @@ def measure(robot: RobotState, terrain: Terrain) -> Measurement:
         projected_gravity=rotate(conjugate(robot.base_quaternion), down),
         base_height=robot.base_position[:, 2] - ground.gather(1, lowest)[:, 0],
         torso_orientation=multiply(about_axis(2, -heading), robot.torso_quaternion),
+        capture_point=rotate_about_vertical(-heading, capture_point),
         foot_position=position,
         foot_velocity=velocity,
         foot_force=force,

@@ -34,6 +34,7 @@ PRIVILEGED: tuple[Block[PrivilegedView], ...] = (
     *FRAME,
     Block("base_height_error", signs(1), lambda v: height_error(v.measured, v.command)[:, None]),
     Block("torso_error", AXIAL_VECTOR, lambda v: torso_error(v.measured, v.command)),
+    Block("capture_point", signs(1, -1), lambda v: v.measured.capture_point),
     Block("mean_velocity_error", signs(1, -1, -1), lambda v: v.mean_velocity_error),
     Block("foot_contact", PAIR, lambda v: v.measured.foot_contact.float(), normalized=False),
     Block("foot_clearance", PAIR, lambda v: v.measured.foot_clearance),

@@ -41,6 +41,10 @@ class RobotState:
     """Pelvis (N, 3) [m/s]."""
     base_angular_velocity: Tensor
     """Pelvis (N, 3) [rad/s], in the pelvis frame."""
+    center_of_mass: Tensor
+    """Of the whole robot (N, 3) [m]."""
+    center_of_mass_velocity: Tensor
+    """(N, 3) [m/s]"""
     torso_quaternion: Tensor
     """(N, 4) wxyz."""
     foot_position: Tensor
@@ -138,6 +142,8 @@ class BatchSimulation:
             base_quaternion=self._tensor(base_qpos[:, 3:]),
             base_linear_velocity=self._tensor(base_qvel[:, :3]),
             base_angular_velocity=self._tensor(base_qvel[:, 3:]),
+            center_of_mass=sensor("center_of_mass_position"),
+            center_of_mass_velocity=sensor("center_of_mass_linear_velocity"),
             torso_quaternion=sensor(f"{TORSO_BODY}_quaternion"),
             foot_position=pair("foot", "position"),
             foot_velocity=pair("foot", "velocity"),

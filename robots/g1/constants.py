@@ -82,6 +82,8 @@ JOINTS: tuple[Joint, ...] = (*_leg("left"), *_leg("right"), *_WAIST, *_arm("left
 JOINT_NAMES: tuple[str, ...] = tuple(joint.name for joint in JOINTS)
 NUM_JOINTS = len(JOINTS)
 
+GRAVITY = 9.81
+"""[m/s^2]"""
 WAIST_JOINTS = slice(12, 15)
 LOWER_JOINTS = slice(0, 15)
 """Legs and waist: the joints that carry the body."""

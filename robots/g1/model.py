@@ -219,7 +219,7 @@ def _add_body_points(spec: mujoco.MjSpec) -> None:
 
 
 def _add_sensors(spec: mujoco.MjSpec) -> None:
-    """Frame sensors of feet, palms and torso, and the net contact force on each foot (world frame)."""
+    """Sensors of feet, palms, torso and center of mass, and of the net contact force on each foot (world frame)."""
     for side, body_name in zip(SIDES, FOOT_BODIES, strict=True):
         for frame in (f"{side}_foot", f"{side}_palm"):
             _add_frame_sensors(spec, frame, mujoco.mjtObj.mjOBJ_SITE)
@@ -228,6 +228,12 @@ def _add_sensors(spec: mujoco.MjSpec) -> None:
         # fields: force only; reduction: net force, expressed in the world frame
         sensor.intprm = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1]
     _add_frame_sensors(spec, TORSO_BODY, mujoco.mjtObj.mjOBJ_XBODY)
+    for suffix, kind in (
+        ("position", mujoco.mjtSensor.mjSENS_SUBTREECOM),
+        ("linear_velocity", mujoco.mjtSensor.mjSENS_SUBTREELINVEL),
+    ):
+        name = f"center_of_mass_{suffix}"
+        spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=PELVIS_BODY)
 
 
 def _add_frame_sensors(spec: mujoco.MjSpec, frame: str, kind: mujoco.mjtObj) -> None:

@@ -57,6 +57,13 @@ def test_tracking_kernels(standing: Transition) -> None:
     assert term("base_height", heights) == pytest.approx([1.0, 0.3679, 0.3679, 0.1353], abs=1e-4)
 
 
+def test_capture_point_counts_while_standing(standing: Transition) -> None:
+    point = torch.tensor([[0.0, 0.0], [0.1, 0.0], [0.0, -0.2], [0.3, 0.4]])
+    walking = torch.tensor([False, False, False, True])
+    seen = replace(moved(standing, capture_point=point), walking=walking)
+    assert term("capture_point", seen) == pytest.approx([1.0, 0.3679, 0.1353, 1.0], abs=1e-4)
+
+
 def test_torso_error_is_the_rotation_between_the_attitudes(standing: Transition) -> None:
     command = standing.command.clone()
     command[:, 4:7] = torch.tensor([0.1, 1.4, -0.5])
@@ -97,8 +104,8 @@ def test_gait_terms_follow_the_clock(standing: Transition) -> None:
     contact = torch.tensor([[False, True], [True, True], [False, False], [True, False]])
     feet = moved(walking, foot_clearance=clearance, foot_contact=contact)
     assert term("contact_schedule", feet) == [1.0, 0.5, 0.5, 0.0]
-    assert term("swing_height", feet) == pytest.approx([1.0, 0.5, 0.0, 0.0])
-    errors = [0.0, 0.05**2, 0.09**2, 2 * 0.09**2]
+    assert term("swing_height", feet) == pytest.approx([0.75, 1.0 / 3.0, 0.0, 0.0])
+    errors = [0.03**2, 0.08**2, 0.12**2, 0.12**2 + 0.09**2]
     assert term("foot_phase", feet) == pytest.approx([2.718281828 ** (-error / 0.003) for error in errors])
     still = replace(feet, walking=torch.zeros(4, dtype=torch.bool))
     assert term("swing_height", still) == [0.0] * 4

@@ -1,5 +1,7 @@
 """The World: how robots are stood up, on which ground, and what is refused."""
 
+import numpy as np
+import pinocchio as pin
 import pytest
 import torch
 
@@ -8,7 +10,9 @@ from lowlevel.world.measures import height_error, torso_error
 from lowlevel.world.terrain import TerrainConfig
 from lowlevel.world.world import CLEARANCE, World
 from robots.errors import PilotError
+from robots.g1.kinematics import build_model, to_pinocchio
 from robots.g1.model import ModelOptions
+from robots.rotations import rotate_about_vertical
 
 SLABS = TerrainConfig(tiles=("irregular",))
 
@@ -61,3 +65,28 @@ def test_what_no_world_can_be_made_of_is_refused() -> None:
         World(ModelOptions(timestep=0.003), TerrainConfig(), num_robots=1, num_threads=1)
     with pytest.raises(PilotError, match="num_robots must be at least 1"):
         World(ModelOptions(), TerrainConfig(), num_robots=0, num_threads=1)
+
+
+def test_the_capture_point_is_pinocchios_center_of_mass_and_its_velocity() -> None:
+    world = World(ModelOptions(), TerrainConfig(), num_robots=1, num_threads=1)
+    simulation, robot = world.simulation, torch.arange(1)
+    limits = simulation.joint_lower, simulation.joint_upper
+    command = command_space(*(limit.tolist() for limit in limits)).neutral()[None]
+    command[:, HEIGHT], command[:, TORSO.start + 1], command[:, ARMS] = 0.6, 0.5, 0.4
+    velocity = torch.tensor([[0.3, -0.2, 0.1, 0.4, -0.5, 0.6]])
+    simulation.restart(robot)
+    world.stand(robot, torch.tensor([[1.0, -2.0]]), torch.tensor([0.7]), command, velocity=velocity)
+    measured = world.measure()
+    state = measured.robot
+    qpos = torch.cat([state.base_position, state.base_quaternion, state.joint_position], dim=1)[0].double().numpy()
+    qvel = torch.cat([state.base_linear_velocity, state.base_angular_velocity, state.joint_velocity], dim=1)
+    q, v = to_pinocchio(qpos, qvel[0].double().numpy())
+    model = build_model()
+    data = model.createData()
+    pin.centerOfMass(model, data, q, v)
+    middle = state.foot_position[0].mean(dim=0).double().numpy()
+    height = data.com[0][2] - middle[2]
+    point = (data.com[0] + data.vcom[0] * np.sqrt(height / 9.81) - middle)[:2]
+    expected = rotate_about_vertical(-measured.heading, torch.tensor(point, dtype=torch.float32)[None])
+    torch.testing.assert_close(measured.capture_point, expected, atol=1e-4, rtol=0.0)
+    assert measured.capture_point.abs().min() > 0.02
