@@ -46,9 +46,9 @@ class AbsorptionConfig:
 def _mirrored(ppo: PPO, observation: dict[str, Tensor], label: Tensor) -> tuple[Tensor, ...]:
     """The mirror image of a sample. An asymmetric clone would spend PPO's first million steps on its mirror loss."""
     history, elevation = (ppo.mirrors(key, observation[key]) for key in ("history", "elevation_map"))
-    velocity, latent = ppo.actor.encode(history, elevation)
+    motion, latent = ppo.actor.encode(history, elevation)
     frame = history[:, -FRAME_SIZE:].clone()
-    return frame, elevation.clone(), observation["flag"].clone(), velocity, latent, ppo.mirrors("action", label)
+    return frame, elevation.clone(), observation["flag"].clone(), motion, latent, ppo.mirrors("action", label)
 
 
 def absorb_prior(
@@ -84,7 +84,7 @@ def absorb_prior(
             teachers_turn = torch.rand(robots, 1, generator=ppo.generator, device=device) < handing_over
             noise = 0.5 * std * torch.randn(label.shape, generator=ppo.generator, device=device)
             action = torch.where(teachers_turn, label, own.mean) + noise
-            samples.append((history[:, -1].clone(), *(c.clone() for c in context), own.velocity, own.latent, label))
+            samples.append((history[:, -1].clone(), *(c.clone() for c in context), own.motion, own.latent, label))
             samples.append(_mirrored(ppo, seen_now, label))
             result = environment.step(action.cpu())
             ended = (result.terminated | result.truncated).to(device)

@@ -209,8 +209,8 @@ class PilotEnvironment:
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
         command, kind = buffers.command, buffers.kind.clone()
-        # The frozen controller goes by the policy's estimate of this velocity.
-        buffers.reference = self.reference.begin_step(buffers.reference, swing_first(measured.linear_velocity))
+        # The frozen controller goes by the policy's estimate of the capture point.
+        buffers.reference = self.reference.begin_step(buffers.reference, swing_first(measured.capture_point))
         next_privileged = build(PRIVILEGED, self._view(measured, ground))
 
         done, now = torch.nonzero(fallen | truncated)[:, 0], measured

@@ -27,7 +27,7 @@ NETWORKS = NetworkConfig(
     prototypes=16,
 )
 _FRAME = Mirror(np.array([1, 0, 3, 2, 4, 5, 6, 7, 8, 9]), np.array([1, 1, -1, -1, -1, 1, -1, 1, 1, 1.0]))
-_PRIVILEGED = Mirror(np.arange(133), np.array([1, -1, 1] + [1] * 130, dtype=float))
+_PRIVILEGED = Mirror(np.arange(133), np.array([1, -1, 1, 1, -1] + [1] * 128, dtype=float))
 MIRRORS = {
     "history": _FRAME.repeated(6),
     "elevation_map": Mirror(np.arange(121).reshape(11, 11)[:, ::-1].reshape(-1), np.ones(121)),

@@ -25,7 +25,7 @@ from lowlevel.control.observation import (
 )
 from lowlevel.control.reference import Reference, ReferenceState
 from lowlevel.control.stepping import swing_first
-from lowlevel.networks.actor import PilotActor
+from lowlevel.networks.actor import CAPTURE_POINT, PilotActor
 from robots.g1.constants import NUM_JOINTS
 
 Memory = dict[str, Tensor]
@@ -92,6 +92,6 @@ class ControlStep(nn.Module):
         output = self.actor(history.flatten(1), map_observation(elevation_map), flag)
         action = output.mean.clamp(-self.action_limit, self.action_limit)
         targets = self.reference.joint_targets(state) + action * self._action_scale
-        phase = self.reference.begin_step(state, swing_first(output.velocity)).phase
+        phase = self.reference.begin_step(state, swing_first(output.motion[:, CAPTURE_POINT])).phase
         remembered = {"reference": state.command, "phase": phase, "action": action, "history": history}
         return StepResult(targets, output.gate, remembered)

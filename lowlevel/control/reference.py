@@ -119,11 +119,11 @@ class Reference:
         return ReferenceState(slewed, torch.where(walks, walking, self._stopping(state.phase)))
 
     def begin_step(self, state: ReferenceState, swing_first: Tensor) -> ReferenceState:
-        """Let robots at rest make two steps, unless their posture is too deep to walk in.
+        """Let robots at rest make two steps.
 
         ``swing_first`` (N,): the foot to begin with, 1 left, -1 right, 0 for no step.
         """
-        steps = (swing_first != 0.0) & ~state.walking & self._can_walk(state.command)[:, 0]
+        steps = (swing_first != 0.0) & ~state.walking
         beginning = torch.where(swing_first > 0.0, 0.0, math.pi) + self._phase_step
         return state._replace(phase=torch.where(steps, beginning, state.phase))
 

@@ -1,4 +1,4 @@
-"""The loss of the history encoder: velocity regression and swapped prediction of the next state.
+"""The loss of the history encoder: regression of the robot's motion and swapped prediction of the next state.
 
 The contrastive part follows the hybrid internal model (HIMLoco, arXiv 2312.11460; PIM, arXiv 2411.14386),
 which is SwAV (arXiv 2006.09882) between the predicted and the true next state. Two constants differ from
@@ -24,6 +24,8 @@ class EstimationConfig:
 
     velocity_weight: float = 1.0
     """Weight of the squared velocity error, mean over components [(m/s)^-2]."""
+    capture_point_weight: float = 10.0
+    """Weight of the squared error of the capture point, mean over components [m^-2]."""
     contrastive_weight: float = 0.1
     """Weight of the swapped-prediction loss."""
     temperature: float = 0.1
@@ -34,6 +36,10 @@ class EstimationConfig:
     """Rounds of row and column scaling."""
 
 
+ESTIMATED = ("velocity", "capture_point")
+"""Whose mean squared errors are among the terms."""
+
+
 class EstimationTerms(NamedTuple):
     """The loss and what it is made of; all scalars, on the device of the inputs."""
 
@@ -41,6 +47,8 @@ class EstimationTerms(NamedTuple):
     """Weighted sum to minimize."""
     velocity_mse: Tensor
     """Mean squared velocity error over samples and components [m^2/s^2]."""
+    capture_point_mse: Tensor
+    """The same of the capture point [m^2]."""
     contrastive: Tensor
     """Swapped-prediction loss; ln(prototypes) when assignments are predicted no better than by chance."""
     agreement: Tensor
@@ -72,19 +80,20 @@ def entropy(probabilities: Tensor) -> Tensor:
 
 
 def estimation_loss(
-    velocity: Tensor,
+    motion: Tensor,
     latent: Tensor,
-    true_velocity: Tensor,
+    true_motion: Tensor,
     target_latent: Tensor,
     prototypes: Tensor,
     config: EstimationConfig,
 ) -> EstimationTerms:
     """Loss of the estimator for N samples.
 
-    ``velocity`` and ``true_velocity`` (N, 3) [m/s]; ``latent`` predicted from the history and
-    ``target_latent`` encoded from the true next state, (N, D) of unit length; ``prototypes`` (K, D).
+    ``motion`` and ``true_motion`` (N, 5): velocity [m/s] and capture point [m]; ``latent`` predicted from the history
+    and ``target_latent`` encoded from the true next state, (N, D) of unit length; ``prototypes`` (K, D).
     """
-    velocity_mse = (velocity - true_velocity).square().mean()
+    errors = (motion - true_motion).square()
+    velocity_mse, capture_point_mse = errors[:, :3].mean(), errors[:, 3:].mean()
     directions = torch.nn.functional.normalize(prototypes, dim=1)
     predicted_scores = latent @ directions.T
     target_scores = target_latent @ directions.T
@@ -100,5 +109,13 @@ def estimation_loss(
         agreement = (predicted_scores.argmax(dim=1) == target_assignment.argmax(dim=1)).float().mean()
         assignment_entropy = entropy(probabilities).mean() / largest
         usage_entropy = entropy(probabilities.mean(dim=0)) / largest
-    loss = config.velocity_weight * velocity_mse + config.contrastive_weight * contrastive
-    return EstimationTerms(loss, velocity_mse, contrastive, agreement, assignment_entropy, usage_entropy)
+    regression = config.velocity_weight * velocity_mse + config.capture_point_weight * capture_point_mse
+    return EstimationTerms(
+        regression + config.contrastive_weight * contrastive,
+        velocity_mse,
+        capture_point_mse,
+        contrastive,
+        agreement,
+        assignment_entropy,
+        usage_entropy,
+    )

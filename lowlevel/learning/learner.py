@@ -19,7 +19,7 @@ from torch.distributions import Normal, kl_divergence
 from lowlevel.learning.estimation import EstimationConfig, estimation_loss
 from lowlevel.learning.symmetry import TensorMirrors
 from lowlevel.networks.actor import (
-    VELOCITY_SIZE,
+    MOTION_SIZE,
     ActorOutput,
     Critic,
     NetworkConfig,
@@ -33,7 +33,7 @@ from robots.errors import PilotError
 
 ACTOR_KEYS = ("history", "elevation_map", "flag")
 """What the policy sees."""
-POLICY_KEYS = ("frame", "elevation_map", "flag", "velocity", "latent")
+POLICY_KEYS = ("frame", "elevation_map", "flag", "motion", "latent")
 """What it decides on: the current frame is the end of the history, the last two are its own estimates."""
 
 
@@ -204,11 +204,11 @@ class Learner:
         return {"actor": loss, **figures}
 
     def _estimator_losses(self, samples: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        velocity, latent = self.actor.encode(samples["history"], samples["elevation_map"])
+        motion, latent = self.actor.encode(samples["history"], samples["elevation_map"])
         target = self.target_encoder(self.critic.normalized(samples["next_privileged"]))
-        true_velocity = samples["privileged"][:, :VELOCITY_SIZE]
+        true_motion = samples["privileged"][:, :MOTION_SIZE]
         prototypes = self.target_encoder.prototypes
-        terms = estimation_loss(velocity, latent, true_velocity, target, prototypes, self.config.estimation)
+        terms = estimation_loss(motion, latent, true_motion, target, prototypes, self.config.estimation)
         figures = {f"estimation/{name}": term for name, term in terms._asdict().items() if name != "loss"}
         return {"estimator": terms.loss, **figures}
 

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 from torch.distributions import kl_divergence
 
+from lowlevel.learning.estimation import ESTIMATED
 from lowlevel.learning.learner import ACTOR_KEYS, POLICY_KEYS, Learner, PPOConfig
 from lowlevel.learning.rollout import RolloutStorage, generalized_advantages, normalized_by_task
 from lowlevel.learning.symmetry import TensorMirrors
-from lowlevel.networks.actor import VELOCITY_SIZE, NetworkConfig, ObservationSizes
+from lowlevel.networks.actor import MOTION_SIZE, NetworkConfig, ObservationSizes
 from lowlevel.runs.checks import NonFiniteError, require_finite
 from lowlevel.runs.distributed import rank
 from robots.errors import PilotError
@@ -86,7 +87,7 @@ class PPO:
         widths = {"history": sizes.history, "elevation_map": sizes.elevation_map, "flag": 1}
         widths |= {"privileged": sizes.privileged, "next_privileged": sizes.privileged}
         widths |= {"action": sizes.action, "mean": sizes.action}
-        widths |= {"velocity": VELOCITY_SIZE, "latent": network_config.latent}
+        widths |= {"motion": MOTION_SIZE, "latent": network_config.latent}
         shapes: dict[str, tuple[int, ...]] = {name: (width,) for name, width in widths.items()}
         shapes |= dict.fromkeys(("log_prob", "reward", "advantage", "returns"), ())
         self._shapes = shapes
@@ -127,7 +128,7 @@ class PPO:
             for key, values in observation.items():
                 require_finite(f"observation {key!r} at rollout step {self.storage.position}", values)
             require_finite(f"action at rollout step {self.storage.position}", action)
-        estimates = {"velocity": output.velocity, "latent": output.latent}
+        estimates = {"motion": output.motion, "latent": output.latent}
         acted = {
             "action": action,
             "mean": output.mean,
@@ -236,7 +237,7 @@ class PPO:
             for name, number in self.learner.step(losses).items():
                 history.setdefault(name, []).append(number)
         means = {name: sum(numbers) / len(numbers) for name, numbers in history.items()}
-        means["estimation/velocity_rmse"] = math.sqrt(means.pop("estimation/velocity_mse"))
+        means |= {f"estimation/{name}_rmse": math.sqrt(means.pop(f"estimation/{name}_mse")) for name in ESTIMATED}
         means["estimation/policy_drift"] = self._estimator_drift()
         means |= {"explained_variance": explained, "std": float(old_std[self.learner.acting].mean())}
         if not calibrating:
@@ -290,7 +291,7 @@ class PPO:
             part = slice(start, start + self._minibatch)
             output = self.learner.policy({key: rows(key)[part] for key in ACTOR_KEYS})
             rows("mean")[part].copy_(output.mean)
-            rows("velocity")[part].copy_(output.velocity)
+            rows("motion")[part].copy_(output.motion)
             rows("latent")[part].copy_(output.latent)
             rows("log_prob")[part].copy_(self.learner.log_prob(output.mean, rows("action")[part]))
 
@@ -317,9 +318,9 @@ class PPO:
         share = max(1, int(self.config.mirror_loss_share * len(index)))
         rows = {key: self.storage.flat(key).index_select(0, index[-share:]) for key in ACTOR_KEYS}
         image = {key: self.mirrors(key, values) for key, values in rows.items()}
-        velocity, latent = self.actor.encode(image["history"], image["elevation_map"])
+        motion, latent = self.actor.encode(image["history"], image["elevation_map"])
         frame = image.pop("history")[:, -self.sizes.frame :].clone()
-        return {**image, "frame": frame, "velocity": velocity, "latent": latent}
+        return {**image, "frame": frame, "motion": motion, "latent": latent}
 
     def _rows(self, name: str) -> Tensor:
         if name == "frame":

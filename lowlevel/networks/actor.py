@@ -18,8 +18,10 @@ from lowlevel.networks.normalizer import RunningNormalizer
 
 __all__ = ["ActorOutput", "Critic", "NetworkConfig", "ObservationSizes", "PilotActor", "TargetEncoder"]
 
-VELOCITY_SIZE = 3
-"""Components of the base linear velocity."""
+MOTION_SIZE = 5
+"""Components of the motion that is estimated: the base's linear velocity (3) and the capture point (2)."""
+
+CAPTURE_POINT = slice(3, 5)
 
 
 class ActorOutput(NamedTuple):
@@ -29,8 +31,8 @@ class ActorOutput(NamedTuple):
     """Mean action (N, A)."""
     gate: Tensor
     """Probability of each expert (N, E); ones (N, 1) for the monolithic ablation."""
-    velocity: Tensor
-    """Estimated base linear velocity (N, 3) [m/s], heading frame."""
+    motion: Tensor
+    """Estimated base linear velocity [m/s] and capture point [m] (N, 5), heading frame."""
     latent: Tensor
     """Predicted latent of the next state (N, latent), unit length."""
 
@@ -42,23 +44,24 @@ def small_output_(weight: Tensor, bias: Tensor, gain: float) -> None:
 
 
 class HistoryEncoder(nn.Module):
-    """History and map to base velocity and next-state latent.
+    """History and map to the robot's motion and next-state latent.
 
-    Paper III-B-1; the estimator of PIM (arXiv 2411.14386).
+    Paper III-B-1; the estimator of PIM (arXiv 2411.14386), which has the velocity alone. Where a robot that stands will
+    topple to is as much worth knowing, and takes all joints to tell.
     """
 
     def __init__(self, sizes: ObservationSizes, config: NetworkConfig) -> None:
         super().__init__()
-        outputs = VELOCITY_SIZE + config.latent
+        outputs = MOTION_SIZE + config.latent
         self.vision = config.vision
         inputs = sizes.history + (sizes.elevation_map if config.vision else 0)
         self.layers = perceptron(inputs, config.history_hidden, outputs)
 
     def forward(self, history: Tensor, elevation_map: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalized history (N, H) and map (N, M) to velocity (N, 3) [m/s] and unit latent (N, latent)."""
+        """Normalized history (N, H) and map (N, M) to motion (N, 5) and unit latent (N, latent)."""
         inputs = torch.cat([history, elevation_map], dim=1) if self.vision else history
         outputs = self.layers(inputs)
-        return outputs[:, :VELOCITY_SIZE], functional.normalize(outputs[:, VELOCITY_SIZE:], dim=1)
+        return outputs[:, :MOTION_SIZE], functional.normalize(outputs[:, MOTION_SIZE:], dim=1)
 
 
 class MixtureOfExperts(nn.Module):
@@ -147,7 +150,7 @@ class PilotActor(nn.Module):
         encoder = MapEncoder if config.attention else PlainMapEncoder
         self.map_encoder: nn.Module = encoder(sizes, config).requires_grad_(config.vision)
         self.perception_size = config.map_global + config.attention_width if config.vision else 0
-        inputs = self.perception_size + config.latent + VELOCITY_SIZE + sizes.frame + 1
+        inputs = self.perception_size + config.latent + MOTION_SIZE + sizes.frame + 1
         head = MixtureOfExperts if config.mixture else MonolithicActor
         self.head: MixtureOfExperts | MonolithicActor = head(inputs, sizes.action, config)
         self.log_std = nn.Parameter(torch.full((sizes.action,), math.log(initial_std)))
@@ -166,25 +169,25 @@ class PilotActor(nn.Module):
         self.head.silence(actions)
 
     def encode(self, history: Tensor, elevation_map: Tensor) -> tuple[Tensor, Tensor]:
-        """Raw history (N, H) and map (N, M) [m] to velocity (N, 3) [m/s] and unit latent (N, latent)."""
+        """Raw history (N, H) and map (N, M) [m] to motion (N, 5) and unit latent (N, latent)."""
         frames = self.normalizer(history.unflatten(1, (-1, self.sizes.frame)))
         return self.history_encoder(frames.flatten(1), self._heights(elevation_map))
 
     def decide(
-        self, frame: Tensor, elevation_map: Tensor, flag: Tensor, velocity: Tensor, latent: Tensor
+        self, frame: Tensor, elevation_map: Tensor, flag: Tensor, motion: Tensor, latent: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Raw current frame (N, F), elevation map (N, M) [m], flag (N, 1) and estimates to mean and gate."""
         current = self.normalizer(frame)
-        inputs = [latent.detach(), velocity.detach(), current, flag]
+        inputs = [latent.detach(), motion.detach(), current, flag]
         if self.config.vision:
             inputs.insert(0, self.map_encoder(self._heights(elevation_map), current))
         return self.head(torch.cat(inputs, dim=1))
 
     def forward(self, history: Tensor, elevation_map: Tensor, flag: Tensor) -> ActorOutput:
         """Raw history (N, H), elevation map (N, M) [m] and tracking flag (N, 1) to the policy's outputs."""
-        velocity, latent = self.encode(history, elevation_map)
-        mean, gate = self.decide(history[:, -self.sizes.frame :], elevation_map, flag, velocity, latent)
-        return ActorOutput(mean, gate, velocity, latent)
+        motion, latent = self.encode(history, elevation_map)
+        mean, gate = self.decide(history[:, -self.sizes.frame :], elevation_map, flag, motion, latent)
+        return ActorOutput(mean, gate, motion, latent)
 
     def _heights(self, elevation_map: Tensor) -> Tensor:
         return (elevation_map - self.config.map_offset) * self.config.map_scale

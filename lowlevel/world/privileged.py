@@ -31,10 +31,10 @@ class PrivilegedView(FrameView):
 
 PRIVILEGED: tuple[Block[PrivilegedView], ...] = (
     Block("base_linear_velocity", VECTOR, lambda v: v.measured.linear_velocity),
+    Block("capture_point", signs(1, -1), lambda v: v.measured.capture_point),
     *FRAME,
     Block("base_height_error", signs(1), lambda v: height_error(v.measured, v.command)[:, None]),
     Block("torso_error", AXIAL_VECTOR, lambda v: torso_error(v.measured, v.command)),
-    Block("capture_point", signs(1, -1), lambda v: v.measured.capture_point),
     Block("mean_velocity_error", signs(1, -1, -1), lambda v: v.mean_velocity_error),
     Block("foot_contact", PAIR, lambda v: v.measured.foot_contact.float(), normalized=False),
     Block("foot_clearance", PAIR, lambda v: v.measured.foot_clearance),
@@ -47,7 +47,7 @@ PRIVILEGED: tuple[Block[PrivilegedView], ...] = (
     Block("flag", signs(1), lambda v: v.flag, normalized=False),
     Block("elevation_map", MAP_MIRROR, lambda v: v.elevation, normalized=False),
 )
-"""What the critic sees, noise-free; the true base velocity (heading frame) comes first."""
+"""What the critic sees, noise-free. First comes what the policy's history encoder estimates."""
 PRIVILEGED_SIZE = sum(block.size for block in PRIVILEGED)
 
 MIRRORS: dict[str, Mirror] = {

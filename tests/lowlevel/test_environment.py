@@ -209,7 +209,8 @@ def test_a_standing_robot_that_is_pushed_steps() -> None:
     push = torch.tensor([[0.1, 0, 0], [0.6, 0, 0], [-0.6, 0, 0], [0, 0.6, 0], [0, -0.6, 0], [0, 0, 0]])
     turned = rotate_about_vertical(environment.world.measure().heading, push)
     environment.simulation.push(turned)
-    environment.step(torch.zeros(6, 29))
+    for _ in range(5):
+        environment.step(torch.zeros(6, 29))
     walking, clock = environment.buffers.reference.walking, environment.buffers.reference.clock
     assert walking.tolist() == [False, True, True, True, True, False]
     assert clock[3, 0] < 0.0 < clock[4, 0], "pushed to the left it swings the right foot, and the other way round"
@@ -288,8 +289,8 @@ def test_every_reward_weight_has_a_term_and_every_term_a_weight() -> None:
 
 def test_frozen_controller_repeats_the_training_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Controller.act on noise-free measurements gives the targets that the environment applies."""
-    # An untrained policy's estimate of its velocity says nothing about when to step.
-    monkeypatch.setattr("lowlevel.control.stepping.LARGEST_SPEED", math.inf)
+    # An untrained policy's estimate of its capture point says nothing about when to step.
+    monkeypatch.setattr("lowlevel.control.stepping.FARTHEST", math.inf)
     stage = Stage(arms_act=True, randomization=QUIET.randomization)
     config = TrainingConfig(environment=QUIET, ppo=PPOConfig(steps_per_update=8, minibatches=2), stages=(stage,))
     trainer = Trainer(config, tmp_path)

@@ -28,21 +28,22 @@ def test_sinkhorn_assigns_every_sample_and_uses_prototypes_equally() -> None:
 def test_contrastive_term_is_the_swapped_cross_entropy_summed_over_prototypes() -> None:
     config = EstimationConfig()
     latent, target, prototypes = _unit(64, 8, seed=1), _unit(64, 8, seed=2), _unit(16, 8, seed=3)
-    velocity, truth = torch.zeros(64, 3), torch.full((64, 3), 0.5)
-    terms = estimation_loss(velocity, latent, truth, target, prototypes, config)
+    motion, truth = torch.zeros(64, 5), torch.tensor([[0.5, 0.5, 0.5, 0.2, 0.2]]).repeat(64, 1)
+    terms = estimation_loss(motion, latent, truth, target, prototypes, config)
     expected = 0.0
     for own, other in ((latent, target), (target, latent)):
         assignment = sinkhorn(other @ prototypes.T, config.sinkhorn_temperature, config.sinkhorn_iterations)
         expected += 0.5 * float(functional.cross_entropy(own @ prototypes.T / config.temperature, assignment))
     assert float(terms.contrastive) == pytest.approx(expected, rel=1e-5)
     assert float(terms.velocity_mse) == pytest.approx(0.25)
-    assert float(terms.loss) == pytest.approx(0.25 + 0.1 * expected, rel=1e-5)
+    assert float(terms.capture_point_mse) == pytest.approx(0.04)
+    assert float(terms.loss) == pytest.approx(0.25 + 10.0 * 0.04 + 0.1 * expected, rel=1e-5)
 
 
 def test_ignorance_costs_the_logarithm_of_the_number_of_prototypes() -> None:
     latent = functional.normalize(torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(32, 1), dim=1)
     prototypes = functional.normalize(torch.cat([torch.zeros(8, 2), torch.randn(8, 2)], dim=1), dim=1)
-    terms = estimation_loss(torch.zeros(32, 3), latent, torch.zeros(32, 3), latent, prototypes, EstimationConfig())
+    terms = estimation_loss(torch.zeros(32, 5), latent, torch.zeros(32, 5), latent, prototypes, EstimationConfig())
     assert float(terms.contrastive) == pytest.approx(math.log(8), rel=1e-4)
     assert float(terms.assignment_entropy) == pytest.approx(1.0, rel=1e-4)
 
@@ -59,11 +60,11 @@ def _train(shuffled: bool) -> EstimationTerms:
         history = torch.randn(256, SIZES.history, generator=generator)
         privileged = history[:, -SIZES.frame :] @ dynamics
         next_privileged = privileged[torch.randperm(256, generator=generator)] if shuffled else privileged
-        velocity, latent = encoder(history, torch.zeros(256, 121))
+        motion, latent = encoder(history, torch.zeros(256, 121))
         terms = estimation_loss(
-            velocity,
+            motion,
             latent,
-            privileged[:, :3],
+            privileged[:, :5],
             target_encoder(next_privileged),
             target_encoder.prototypes,
             EstimationConfig(contrastive_weight=1.0),
@@ -90,7 +91,7 @@ def test_gradient_does_not_vanish_as_with_the_mean_over_prototypes_at_temperatur
     for temperature, share in ((0.1, 1.0), (3.0, 1.0 / 64.0)):
         latent = _unit(256, 32, seed=1).requires_grad_()
         config = EstimationConfig(temperature=temperature, contrastive_weight=share)
-        terms = estimation_loss(torch.zeros(256, 3), latent, torch.zeros(256, 3), target, prototypes, config)
+        terms = estimation_loss(torch.zeros(256, 5), latent, torch.zeros(256, 5), target, prototypes, config)
         norms.append(float(torch.autograd.grad(terms.loss, latent)[0].norm()))
     assert norms[0] > 500 * norms[1]
 

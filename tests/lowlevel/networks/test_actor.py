@@ -90,7 +90,7 @@ def test_untrained_actions_are_almost_zero_and_all_experts_take_part() -> None:
     output = actor(*_inputs(256))
     assert output.mean.abs().max() < 0.1
     assert output.gate.shape == (256, 4) and output.gate.min() > 0.1
-    assert output.velocity.shape == (256, 3)
+    assert output.motion.shape == (256, 5)
     torch.testing.assert_close(output.latent.norm(dim=1), torch.ones(256))
 
 

@@ -33,7 +33,7 @@ def _fill(ppo: PPO, robots: slice, seed: int) -> dict[str, torch.Tensor]:
                 **mine,
                 "action": action[robots],
                 "mean": output.mean,
-                "velocity": output.velocity,
+                "motion": output.motion,
                 "latent": output.latent,
                 "log_prob": ppo.learner.log_prob(output.mean, action[robots]).detach(),
             }
