@@ -80,6 +80,7 @@ class OnnxPolicy:
         seen = Seen(proprioception, command, self._default, self._memory["action"], phase)
         fed = {entry.name: self._filled(entry, seen) for entry in self.card.inputs}
         fed |= {name: self._memory[f"state {name}"] for name in self.card.states}
+        self._memory["begins"] = torch.zeros(len(command), dtype=torch.bool)
         outputs = self._run({name: value.reshape(-1, *self._shapes[name][1:]) for name, value in fed.items()})
         for name, output in self.card.states.items():
             self._memory[f"state {name}"] = outputs[output]
@@ -112,7 +113,6 @@ class OnnxPolicy:
         begins = self._memory["begins"][:, None, None] & (entry.first == "first frame")
         past = torch.where(begins, frame[:, None], torch.cat([past[:, 1:], frame[:, None]], dim=1))
         self._memory[f"history {entry.name}"] = past
-        self._memory["begins"] = torch.zeros(len(frame), dtype=torch.bool)
         if entry.layout == "frames":
             return past.flatten(1)
         return torch.cat([part.flatten(1) for part in past.split([term.shape[1] for term in terms], dim=2)], dim=1)

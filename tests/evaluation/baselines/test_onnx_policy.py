@@ -116,6 +116,18 @@ def test_history_holds_the_oldest_frame_first(tmp_path: Path, first: str, begin:
     assert terms == [begin, 1.0, 2.0, 10.0 * begin, 10.0, 20.0]
 
 
+def test_every_input_has_a_history_of_its_own(tmp_path: Path) -> None:
+    entries = [
+        Input(name, (Term("height_command", (scale,)),), history=2, first="first frame")
+        for name, scale in (("slow", 1.0), ("fast", 10.0))
+    ]
+    policy = OnnxPolicy(card(*entries), sum_of_inputs(tmp_path / "p.onnx", {"slow": 2, "fast": 2}), LIMITS)
+    policy.reset(1)
+    knee = joint_index("left_knee_joint")
+    assert float(act(policy, told(height=0.5))[0, knee]) == pytest.approx(0.3 + 0.5 * 11.0)
+    assert float(act(policy, told(height=0.7))[0, knee]) == pytest.approx(0.3 + 0.5 * (0.5 + 0.7) * 11.0)
+
+
 def test_positions_are_relative_to_the_default_and_in_the_cards_order(tmp_path: Path) -> None:
     terms = (Term("joint_position", joints=("right_knee_joint", "left_hip_roll_joint")), Term("last_action"))
     policy = OnnxPolicy(card(Input("obs", terms)), sum_of_inputs(tmp_path / "p.onnx", {"obs": 4}), LIMITS)
