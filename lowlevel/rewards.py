@@ -189,7 +189,7 @@ def _feet_apart(t: Transition) -> Tensor:
     return feet[:, 0] - feet[:, 1]
 
 
-def foot_phase(t: Transition, variance: float = 0.003) -> Tensor:
+def foot_phase(t: Transition, variance: float = 0.005) -> Tensor:
     """Kernel on the sole heights against the gait clock, ``variance`` [m^2]: swing foot up, stance foot down."""
     wanted = SWING_HEIGHT * _lift(t).clamp_min(0.0).square()
     return gaussian((t.measured.foot_clearance - wanted).square().sum(-1), variance)
@@ -249,11 +249,12 @@ def mean_angular_velocity(t: Transition, width: float = 0.15) -> Tensor:
 
 
 def capture_point(t: Transition, width: float = 0.1) -> Tensor:
-    """Balance of a robot that stands: the capture point over the middle of the feet; ``width`` [m].
+    """Balance of a robot told to stand: the capture point over the middle of the feet; ``width`` [m].
 
-    A robot that topples over feet at rest drifts for a second before anything else tells that it does.
+    A robot that topples over feet at rest drifts for a second before anything else tells that it does. The steps by which
+    it catches itself are no walk: else toppling would pay.
     """
-    return torch.where(t.walking, 1.0, laplace(t.measured.capture_point.norm(dim=-1), width))
+    return torch.where(is_walking(t.command), 1.0, laplace(t.measured.capture_point.norm(dim=-1), width))
 
 
 def vertical_velocity(t: Transition) -> Tensor:
