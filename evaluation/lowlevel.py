@@ -19,6 +19,7 @@ from evaluation.protocols.arena import BATCH, Arena, batch_steps
 from evaluation.protocols.skills import BARS, FLAT, SKILLS, UNLOADED_BEND, run_skills, skill_episodes
 from evaluation.protocols.skills import EPISODES as SKILL_EPISODES
 from evaluation.protocols.tracking import (
+    COMPARED,
     FIGURES,
     GROUPS,
     SUITES,
@@ -49,8 +50,9 @@ from evaluation.reporting.reports import (
     write_results,
 )
 from evaluation.reporting.statistics import Figure
+from lowlevel.commands import ARMS, CommandSpace
 from lowlevel.control.controller import Controller, add_metrics
-from lowlevel.control.whole_body import WholeBodyController
+from lowlevel.control.whole_body import Supports, WholeBodyController
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.progress import ProgressReport
 from lowlevel.world.measures import TRACKING_FIGURES
@@ -119,6 +121,8 @@ class Evaluation:
     seed: int
     controller: str
     """Content hash, or the name on its card."""
+    supports: Supports
+    """What all of the controllers can be told."""
     ours: Measured
     others: dict[str, Measured]
     """What the other controllers did, by hash or name."""
@@ -149,13 +153,15 @@ def _run(arguments: Arguments) -> None:
         raise PilotError("--record must be between 0 and the number of episodes and of robots")
     suite_terrain(arguments.suite)
     conditions_of(arguments.condition)
-    if arguments.write_metrics and arguments.condition != "nominal":
-        raise PilotError("--write-metrics is for figures under the nominal condition: leave one of the two out")
+    if arguments.write_metrics and (arguments.condition != "nominal" or arguments.against):
+        raise PilotError("--write-metrics is for figures under the nominal condition and of all commands: leave it out")
     check_output(arguments.output)
     name, controller = load_controller(arguments.controller)
     if arguments.write_metrics and not isinstance(controller, Controller):
         raise PilotError(f"--write-metrics stores figures in a controller's folder, and {arguments.controller} is none")
     others = dict(load_controller(path) for path in arguments.against)
+    if len(others) < len(arguments.against):
+        raise PilotError("two of the controllers to compare with have the same name or are the same: leave one out")
     # Small matrix products only lose time to waking threads, and the physics wants the cores.
     torch.set_num_threads(1)
     print(f"evaluating {arguments.controller} on the {arguments.suite} suite", flush=True)
@@ -164,7 +170,7 @@ def _run(arguments: Arguments) -> None:
     def write(folder: Path) -> None:
         write_report(folder, evaluation)
         if arguments.record:
-            _record(controller, arguments, folder)
+            _record(controller, arguments, folder, evaluation.supports)
 
     write_results(arguments.output, write)
     if arguments.write_metrics and isinstance(controller, Controller):
@@ -193,6 +199,7 @@ def evaluate(
         )
 
     arena = arena_of(controller, terrain)
+    _require_common(supports, arena.space)
     space, tiles, seed = arena.space, len(terrain.tiles), arguments.seed
     protocol = protocol_episodes(space, arguments.episodes, seed, tiles)
     walks = walking_episodes(space, arguments.walk_episodes, seed, tiles)
@@ -226,6 +233,7 @@ def evaluate(
         condition=arguments.condition,
         seed=seed,
         controller=name,
+        supports=supports,
         ours=ours,
         others=measured,
         modes=tuple(motion_modes(space)) if modes else (),
@@ -236,12 +244,21 @@ def evaluate(
     )
 
 
-def _record(controller: WholeBodyController, arguments: Arguments, folder: Path) -> None:
+def _require_common(supports: Supports, space: CommandSpace) -> None:
+    for doing, bounds in (("stand", supports.standing), ("walk", supports.walking)):
+        for name, apart in zip(space.names, (bounds.lower > bounds.upper).tolist(), strict=True):
+            if apart:
+                raise PilotError(f"the controllers have no {name} in common while they {doing}: compare fewer of them")
+
+
+def _record(controller: WholeBodyController, arguments: Arguments, folder: Path, supports: Supports) -> None:
     from evaluation.pictures.recording import record_episodes  # the viewer's library is large and seldom needed here
 
     terrain = suite_terrain(arguments.suite)
     conditions = conditions_of(arguments.condition)
-    arena = Arena(controller, terrain, conditions, num_threads=arguments.threads, batch=arguments.robots)
+    arena = Arena(
+        controller, terrain, conditions, num_threads=arguments.threads, batch=arguments.robots, supports=supports
+    )
     episodes = protocol_episodes(arena.space, arguments.record, arguments.seed, len(terrain.tiles))
     record_episodes(arena, episodes, folder)
 
@@ -306,6 +323,7 @@ def report_text(evaluation: Evaluation) -> str:
         figures=figures,
         paper=PAPER[evaluation.suite],
         comparison=_comparison(evaluation) if evaluation.others else "",
+        told=_told(evaluation.supports),
         by_group=_breakdown(figures, groups),
         by_group_steady=_breakdown(figures, groups, "_steady"),
         by_tile=_breakdown(figures, {tile: f"_on_{tile}" for tile in evaluation.tiles}),
@@ -342,11 +360,24 @@ def _comparison(evaluation: Evaluation) -> str:
     columns = {"ours": evaluation.ours, **evaluation.others}
     differences = _differences(evaluation)
     rows = []
-    for name in (*FIGURES, *UNPAIRED):
+    for name in dict.fromkeys((*COMPARED, *UNPAIRED)):
         values = [format_figure(m.figures[name]) if name in m.figures else "–" for m in columns.values()]
         paired = [format_figure(rows[name]) if name in rows else "–" for rows in differences.values()]
         rows.append([name, *values, *paired])
     return markdown_table(["figure", *columns, *(f"ours - {name}" for name in differences)], rows)
+
+
+def _told(supports: Supports) -> str:
+    """The ranges that commands were cut to."""
+    names = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]", "height [m]", "roll [rad]", "pitch [rad]", "yaw [rad]")
+    rows = []
+    for doing, bounds in (("standing", supports.standing), ("walking", supports.walking)):
+        ranges = [
+            f"{low:.2f} to {high:.2f}" for low, high in zip(bounds.lower.tolist(), bounds.upper.tolist(), strict=True)
+        ]
+        arms = "told" if (bounds.upper - bounds.lower)[ARMS].min() > 0.0 else "at their default"
+        rows.append([doing, *ranges[: ARMS.start], arms])
+    return markdown_table(["", *names, "arms"], rows)
 
 
 def _plain(figures: Mapping[str, Figure]) -> dict[str, dict[str, object]]:

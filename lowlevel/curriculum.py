@@ -31,7 +31,7 @@ class CurriculumConfig:
     steps_between_falls: float = 300.0
     """Control steps of a kind per fall above which it may grow; below half as many it shrinks. Where every robot falls
     no action is better than another, and nothing is learned. For the hardness all kinds together must fall half as
-    often."""
+    often; it goes down again where they fall more often than this."""
     smoothing: float = 0.1
     """Weight of the last update in the measured averages."""
     most_often: float = 2.0

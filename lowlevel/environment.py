@@ -74,7 +74,7 @@ class EnvironmentConfig:
     start_moving: float = 0.3
     """Share of episodes that start at the commanded velocity."""
     action_limit: float = 12.0
-    """Actions are clipped to +- this many action scales; the lift of a knee takes 7."""
+    """Actions are clipped to +- this many action scales; the lift of a knee takes 10."""
     prior: GaitPriorConfig = field(default_factory=GaitPriorConfig)
     reference: ReferenceConfig = field(default_factory=ReferenceConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)

@@ -251,8 +251,8 @@ def mean_angular_velocity(t: Transition, width: float = 0.15) -> Tensor:
 def capture_point(t: Transition, width: float = 0.1) -> Tensor:
     """Balance of a robot told to stand: the capture point over the middle of the feet; ``width`` [m].
 
-    A robot that topples over feet at rest drifts for a second before anything else tells that it does. The steps by which
-    it catches itself are no walk: else toppling would pay.
+    A robot that topples over feet at rest drifts for a second before anything else tells that it does. The steps by
+    which it catches itself count, too: else toppling would pay.
     """
     return torch.where(is_walking(t.command), 1.0, laplace(t.measured.capture_point.norm(dim=-1), width))
 

@@ -288,7 +288,12 @@ class Trainer:
             lines = [line.strip() for line in str(error).splitlines()]
             details = [line for line in lines if not line.endswith(":")] or lines
             raise PilotError(f"the training state belongs to other networks: {' '.join(details)}") from error
-        self.curriculum.load_state_dict(state["curriculum"])
+        try:
+            self.curriculum.load_state_dict(state["curriculum"])
+        except KeyError as error:
+            raise PilotError(
+                f"the state in {self.run.path} is of another version: its curriculum has no {error}"
+            ) from error
         self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
         self.fall_rate = float(state["fall_rate"])
         self.stride = state["stride"]

@@ -49,7 +49,7 @@ class Ranges:
     yaw_rate: Range
     """[rad/s]"""
     height: Range
-    """[m]; of a policy without such a command twice the height at which it stands."""
+    """[m]; of a policy without such a command twice 0.76, what it means to stand upright."""
     walking_height: Range | None = None
     """While it walks; the same by default [m]."""
     torso_roll: Range = (0.0, 0.0)

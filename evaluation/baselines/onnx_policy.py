@@ -26,10 +26,10 @@ from evaluation.baselines.card import (
 )
 from evaluation.baselines.terms import TERMS, Seen, commanded_targets
 from lowlevel.commands import is_walking
-from lowlevel.control.controller import Controller, content_hash
+from lowlevel.control.controller import CONFIG_FILE, ONNX_FILE, Controller, content_hash
 from lowlevel.control.observation import Proprioception
 from lowlevel.control.whole_body import Bounds, Supports, WholeBodyController
-from robots.g1.constants import ARM_JOINTS, JOINT_NAMES, Gains, joint_index
+from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, JOINT_NAMES, Gains, joint_index
 from robots.g1.model import build_spec, joint_limits
 
 CARDS = Path(__file__).parent / "cards"
@@ -51,7 +51,7 @@ class OnnxPolicy:
         self._commanded = joint_numbers(card.commanded_joints)
         self._scale = torch.tensor(card.action.scale)
         stiffness, damping = by_joint(card.stiffness, "stiffness"), by_joint(card.damping, "damping")
-        self.supports = supports_of(card.command, self._default[ARM_JOINTS], arm_limits)
+        self.supports = supports_of(card.command, arm_limits)
         self._session = _session(onnx_file)
         self._shapes = {tensor.name: list(tensor.shape) for tensor in self._session.get_inputs()}
         self.batched = all(isinstance(shape[0], str) for shape in self._shapes.values())
@@ -187,6 +187,12 @@ class OnnxPolicy:
                 name in outputs,
                 f"the card of {card.name} reads {name!r}, but the outputs of {file} are {', '.join(outputs)}",
             )
+        for name, shape in {**inputs, **outputs}.items():
+            rows, rest = shape[:1], shape[1:]
+            _require(
+                len(rows) == 1 and (rows[0] == 1 or isinstance(rows[0], str)) and all(isinstance(n, int) for n in rest),
+                f"{file} has a tensor {name!r} of shape {shape}: the first number must be 1 or free, the others fixed",
+            )
         for name, output in card.states.items():
             fits = inputs[name][1:] == outputs[output][1:]
             _require(
@@ -229,9 +235,10 @@ def joint_numbers(patterns: tuple[str, ...]) -> list[int]:
     return [joint_index(name) for name in joint_names(patterns)]
 
 
-def supports_of(ranges: Ranges, default_arms: Tensor, arm_limits: tuple[Tensor, Tensor]) -> Supports:
-    """What a policy with these ranges can be told, where its arms hang as ``default_arms`` (14,) [rad] if not told."""
-    arms = arm_limits if ranges.arms else (default_arms, default_arms)
+def supports_of(ranges: Ranges, arm_limits: tuple[Tensor, Tensor]) -> Supports:
+    """What a policy with these ranges can be told; if its arms do not listen, they are told to stay at the default."""
+    still = torch.tensor(DEFAULT_POSITION[ARM_JOINTS], dtype=torch.float32)
+    arms = arm_limits if ranges.arms else (still, still)
 
     def bounds(velocity: tuple[Range, Range, Range], height: Range) -> Bounds:
         told = (*velocity, height, ranges.torso_roll, ranges.torso_pitch, ranges.torso_yaw)
@@ -252,6 +259,8 @@ def load_controller(path: Path) -> tuple[str, WholeBodyController]:
     """
     if path.suffix != ".onnx":
         return content_hash(path), Controller.load(path)
+    if path.name == ONNX_FILE and path.with_name(CONFIG_FILE).is_file():
+        raise CardError(f"{path} is part of a controller of PILOT: give its folder")
     limits = torch.tensor(joint_limits(build_spec().compile()), dtype=torch.float32)[ARM_JOINTS]
     policy = load_policy(path, (limits[:, 0], limits[:, 1]))
     return policy.card.name, policy

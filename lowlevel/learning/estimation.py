@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lowlevel.networks.actor import CAPTURE_POINT
 from lowlevel.runs.distributed import sum_over_ranks
 
 
@@ -93,7 +94,7 @@ def estimation_loss(
     and ``target_latent`` encoded from the true next state, (N, D) of unit length; ``prototypes`` (K, D).
     """
     errors = (motion - true_motion).square()
-    velocity_mse, capture_point_mse = errors[:, :3].mean(), errors[:, 3:].mean()
+    velocity_mse, capture_point_mse = errors[:, : CAPTURE_POINT.start].mean(), errors[:, CAPTURE_POINT].mean()
     directions = torch.nn.functional.normalize(prototypes, dim=1)
     predicted_scores = latent @ directions.T
     target_scores = target_latent @ directions.T

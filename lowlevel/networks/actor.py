@@ -129,7 +129,7 @@ class MonolithicActor(nn.Module):
 class PilotActor(nn.Module):
     """The policy: history encoder, map encoder and mixture of experts, with its own observation scaling.
 
-    Velocity and latent enter the policy detached, as in the HIM family of estimators: no policy gradient
+    Motion and latent enter the policy detached, as in the HIM family of estimators: no policy gradient
     reaches the history encoder, which learns from its own loss (:mod:`lowlevel.learning.estimation`). The exploration
     noise is one ``log_std`` per action, independent of the state.
     """

@@ -20,7 +20,7 @@ class ObservationSizes:
     elevation_map: int
     """Cells of the elevation map."""
     privileged: int
-    """Numbers the critic sees; the first three are the base linear velocity [m/s]."""
+    """Numbers the critic sees; the first five are the motion that the history encoder estimates [m/s]."""
     action: int
     """Joints that the policy drives."""
 

@@ -205,7 +205,8 @@ class Randomizer:
         state, config = self.state, self.config
         force = torch.zeros(len(heading), 2, 3, device=heading.device)
         pushed = torch.zeros(len(heading), dtype=torch.bool, device=heading.device)
-        if config.hand_load_probability > 0.0:
+        # Those of an episode that began under other conditions too.
+        if config.hand_load_probability > 0.0 or bool((state.hand_load != 0.0).any()):
             across = robot.palm_position[:, 1] - robot.palm_position[:, 0]
             inwards = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-3)
             squeeze = state.hand_load[:, 1:2] * inwards

@@ -1,7 +1,7 @@
-"""Terrain as boxes on a plane: one list of boxes makes both the collision geometry and the height raster.
+"""Terrain as blocks on a plane: one list of blocks makes both the collision geometry and the height raster.
 
 Every robot of a batch lives in the same world, so the whole terrain is part of one shared model. A tile is a
-square patch made by one function of :data:`TILES`. To add stairs or platforms, add a function there, and name it in the
+square patch made by one function of :data:`TILES`. To add one, add a function there, and name it in the
 terrain of a stage (:mod:`lowlevel.presets`) and in ``evaluation.protocols.tracking.SUITES``.
 """
 
@@ -73,7 +73,7 @@ def irregular(size: float, level: float, rng: np.random.Generator) -> list[Block
 
 
 def rough(size: float, level: float, rng: np.random.Generator) -> list[Block]:
-    """Steps of up to +-6 cm at level 1 every 0.4 m, both ways.
+    """Steps of 0 to 12 cm at level 1 every 0.4 m, both ways: within +-6 cm of the middle.
 
     The ground is the higher one of two crossing strips: a tenth of the blocks that as many slabs would take.
     """

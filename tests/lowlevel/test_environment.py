@@ -22,11 +22,12 @@ from lowlevel.control.observation import (
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 from lowlevel.export import export_controller
 from lowlevel.learning.ppo import PPOConfig
+from lowlevel.networks.actor import CAPTURE_POINT, MOTION_SIZE
 from lowlevel.rewards import REWARD_TERMS, RewardWeights
 from lowlevel.stages import Stage
 from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.measures import TRACKING_FIGURES
-from lowlevel.world.privileged import MIRRORS, PRIVILEGED_SIZE
+from lowlevel.world.privileged import MIRRORS, PRIVILEGED, PRIVILEGED_SIZE
 from lowlevel.world.randomization import RandomizationConfig
 from lowlevel.world.terrain import TerrainConfig
 from robots.rotations import rotate_about_vertical
@@ -328,3 +329,21 @@ def test_tracking_figures_vanish_for_a_robot_that_does_as_told() -> None:
     command[:, 7:] = measured.robot.joint_position[:, 15:]
     for name in ("E_v", "E_omega", "E_h", "E_arm", "E_stumble"):
         assert TRACKING_FIGURES[name][1](measured, command).abs().max() < 1e-5, name
+
+
+def test_the_history_encoder_estimates_what_the_critics_view_begins_with() -> None:
+    assert columns(PRIVILEGED, "base_linear_velocity") == slice(0, CAPTURE_POINT.start)
+    assert columns(PRIVILEGED, "capture_point") == CAPTURE_POINT and CAPTURE_POINT.stop == MOTION_SIZE
+
+
+def test_a_load_ends_with_its_episode_when_conditions_get_easier_again() -> None:
+    loaded = replace(QUIET.randomization, hand_load_probability=1.0, hand_payload=(10.0, 10.0))
+    environment = PilotEnvironment(replace(QUIET, randomization=loaded, episode_length=0.1))
+    environment.reset()
+    environment.step(torch.zeros(6, 29))
+    environment.randomizer.config = QUIET.randomization
+    environment.step(torch.zeros(6, 29))
+    assert (environment.buffers.hand_force.norm(dim=-1) > 1.0).all(), "until the episode is over it is still there"
+    for _ in range(5):
+        environment.step(torch.zeros(6, 29))
+    assert not environment.buffers.hand_force.any()

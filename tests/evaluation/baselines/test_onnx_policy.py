@@ -15,8 +15,10 @@ from onnx import TensorProto, helper, numpy_helper
 from evaluation.baselines.card import Action, CardError, Clock, Input, PolicyCard, Ranges, Source, Term, read_card
 from evaluation.baselines.onnx_policy import CARDS, OnnxPolicy, load_controller, load_policy
 from evaluation.baselines.terms import upright_orientation
+from evaluation.lowlevel import main as evaluate
 from evaluation.protocols.arena import Arena, constant
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
+from lowlevel.control.controller import Controller
 from lowlevel.control.observation import Proprioception
 from lowlevel.world.terrain import TerrainConfig
 from robots.g1.constants import ARM_JOINTS, JOINT_NAMES, joint_index
@@ -236,6 +238,18 @@ def test_what_does_not_fit_is_named(tmp_path: Path, changes: dict[str, object], 
         OnnxPolicy(replace(fits, **changes), file, LIMITS)  # type: ignore[arg-type]
 
 
+def test_shapes_that_cannot_be_filled_are_named(tmp_path: Path) -> None:
+    file = sum_of_inputs(tmp_path / "p.onnx", {"obs": 1}, batch=2)
+    with pytest.raises(CardError, match=r"a tensor 'obs' of shape \[2, 1\]: the first number must be 1 or free"):
+        OnnxPolicy(card(Input("obs", (Term("walks"),))), file, LIMITS)
+
+
+def test_a_controller_of_pilot_is_given_by_its_folder(untrained_controller: Path) -> None:
+    with pytest.raises(CardError, match="give its folder"):
+        load_controller(untrained_controller / "controller.onnx")
+    assert isinstance(load_controller(untrained_controller)[1], Controller)
+
+
 def test_a_recurrent_file_needs_its_state(tmp_path: Path) -> None:
     file = sum_of_inputs(tmp_path / "p.onnx", {"obs": 1, "memory": 2}, states=("memory",))
     with pytest.raises(
@@ -288,3 +302,31 @@ def test_arm_joints_follow_the_command_of_a_policy_that_leaves_them_alone(tmp_pa
     command = torch.zeros(1, 21)
     command[0, ARMS] = torch.linspace(-1.0, 1.0, 14)
     assert torch.equal(act(policy, command)[0, ARM_JOINTS], command[0, ARMS])
+
+
+def test_a_stranger_is_evaluated_and_compared(tmp_path: Path, untrained_controller: Path) -> None:
+    """By the command: a policy without experts, alone and beside PILOT's."""
+    file = sum_of_inputs(tmp_path / "p.onnx", {"obs": 1})
+    file.with_suffix(".json").write_text(json.dumps(asdict(card(Input("obs", (Term("walks"),))))))
+    options = ["--episodes", "1", "--walk-episodes", "1", "--skill-episodes", "0", "--robots", "1", "--threads", "1"]
+    evaluate(["--controller", str(file), "--output", str(tmp_path / "alone"), *options])
+    assert not (tmp_path / "alone" / "experts.png").exists()
+    text = (tmp_path / "alone" / "report.md").read_text()
+    assert "Controller `a stranger`" in text and "## Experts" not in text
+    assert "| standing | 0.00 to 0.00 | 0.00 to 0.00 | 0.00 to 0.00 | 0.50 to 0.74 |" in text
+    ours = ["--controller", str(untrained_controller), "--output", str(tmp_path / "both"), *options]
+    evaluate([*ours, "--against", str(file)])
+    content = json.loads((tmp_path / "both" / "metrics.json").read_text())
+    assert set(content["others"]) == set(content["differences"]) == {"a stranger"}
+    with pytest.raises(SystemExit, match="same name or are the same"):
+        evaluate([*ours, "--against", str(file), str(file)])
+    with pytest.raises(SystemExit, match="leave it out"):
+        evaluate([*ours, "--against", str(file), "--write-metrics"])
+
+
+def test_controllers_with_nothing_in_common_are_not_compared(tmp_path: Path, untrained_controller: Path) -> None:
+    low = card(Input("obs", (Term("walks"),)), command=Ranges((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), height=(0.1, 0.2)))
+    file = sum_of_inputs(tmp_path / "p.onnx", {"obs": 1})
+    file.with_suffix(".json").write_text(json.dumps(asdict(low)))
+    with pytest.raises(SystemExit, match="have no base_height in common while they stand"):
+        evaluate(["--controller", str(untrained_controller), "--against", str(file), "--output", str(tmp_path / "x")])
