@@ -153,8 +153,8 @@ def _run(arguments: Arguments) -> None:
         raise PilotError("--record must be between 0 and the number of episodes and of robots")
     suite_terrain(arguments.suite)
     conditions_of(arguments.condition)
-    if arguments.write_metrics and (arguments.condition != "nominal" or arguments.against):
-        raise PilotError("--write-metrics is for figures under the nominal condition and of all commands: leave it out")
+    if arguments.write_metrics and arguments.condition != "nominal":
+        raise PilotError("--write-metrics is for figures under the nominal condition: leave one of the two out")
     check_output(arguments.output)
     name, controller = load_controller(arguments.controller)
     if arguments.write_metrics and not isinstance(controller, Controller):
@@ -162,6 +162,8 @@ def _run(arguments: Arguments) -> None:
     others = dict(load_controller(path) for path in arguments.against)
     if len(others) < len(arguments.against):
         raise PilotError("two of the controllers to compare with have the same name or are the same: leave one out")
+    if arguments.write_metrics and not common_supports(controller, others).covers(controller.supports):
+        raise PilotError("--write-metrics is for figures of all commands, and these controllers share only some")
     # Small matrix products only lose time to waking threads, and the physics wants the cores.
     torch.set_num_threads(1)
     print(f"evaluating {arguments.controller} on the {arguments.suite} suite", flush=True)
@@ -189,9 +191,7 @@ def evaluate(
     began = time.monotonic()
     terrain = suite_terrain(arguments.suite)
     conditions = conditions_of(arguments.condition)
-    supports = controller.supports
-    for other in others.values():
-        supports = supports & other.supports
+    supports = common_supports(controller, others)
 
     def arena_of(tested: WholeBodyController, tiles: TerrainConfig) -> Arena:
         return Arena(
@@ -242,6 +242,14 @@ def evaluate(
         period=arena.period,
         seconds=time.monotonic() - began,
     )
+
+
+def common_supports(controller: WholeBodyController, others: Mapping[str, WholeBodyController]) -> Supports:
+    """What all of them can be told."""
+    supports = controller.supports
+    for other in others.values():
+        supports = supports & other.supports
+    return supports
 
 
 def _require_common(supports: Supports, space: CommandSpace) -> None:

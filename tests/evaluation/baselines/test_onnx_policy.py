@@ -320,7 +320,7 @@ def test_a_stranger_is_evaluated_and_compared(tmp_path: Path, untrained_controll
     assert set(content["others"]) == set(content["differences"]) == {"a stranger"}
     with pytest.raises(SystemExit, match="same name or are the same"):
         evaluate([*ours, "--against", str(file), str(file)])
-    with pytest.raises(SystemExit, match="leave it out"):
+    with pytest.raises(SystemExit, match="these controllers share only some"):
         evaluate([*ours, "--against", str(file), "--write-metrics"])
 
 
