@@ -190,15 +190,8 @@ def evaluate(
     """Run the protocol, the walking test and the skill tests with all controllers, the motion modes with the first."""
     began = time.monotonic()
     terrain = suite_terrain(arguments.suite)
-    conditions = conditions_of(arguments.condition)
     supports = common_supports(controller, others)
-
-    def arena_of(tested: WholeBodyController, tiles: TerrainConfig) -> Arena:
-        return Arena(
-            tested, tiles, conditions, num_threads=arguments.threads, batch=arguments.robots, supports=supports
-        )
-
-    arena = arena_of(controller, terrain)
+    arena = _arena(controller, terrain, arguments, supports)
     _require_common(supports, arena.space)
     space, tiles, seed = arena.space, len(terrain.tiles), arguments.seed
     protocol = protocol_episodes(space, arguments.episodes, seed, tiles)
@@ -214,14 +207,14 @@ def evaluate(
             progress.update(task, advance=steps)
 
         def measure(tested: WholeBodyController, whose: str) -> Measured:
-            arena = arena_of(tested, terrain)
+            arena = _arena(tested, terrain, arguments, supports)
             progress.update(task, description=f"tracking{whose}")
             table, transient = run_tracking(arena, protocol, advance)
             progress.update(task, description=f"walking{whose}")
             figures = tracking_figures(table, terrain.tiles) | run_walking(arena, walks, advance)
             if arguments.skill_episodes:
                 progress.update(task, description=f"skills{whose}")
-                figures |= run_skills(arena_of(tested, FLAT), skills, advance)
+                figures |= run_skills(_arena(tested, FLAT, arguments, supports), skills, advance)
             return Measured(figures, table, transient)
 
         ours = measure(controller, "")
@@ -244,6 +237,11 @@ def evaluate(
     )
 
 
+def _arena(tested: WholeBodyController, terrain: TerrainConfig, arguments: Arguments, supports: Supports) -> Arena:
+    conditions, threads = conditions_of(arguments.condition), arguments.threads
+    return Arena(tested, terrain, conditions, num_threads=threads, batch=arguments.robots, supports=supports)
+
+
 def common_supports(controller: WholeBodyController, others: Mapping[str, WholeBodyController]) -> Supports:
     """What all of them can be told."""
     supports = controller.supports
@@ -263,10 +261,7 @@ def _record(controller: WholeBodyController, arguments: Arguments, folder: Path,
     from evaluation.pictures.recording import record_episodes  # the viewer's library is large and seldom needed here
 
     terrain = suite_terrain(arguments.suite)
-    conditions = conditions_of(arguments.condition)
-    arena = Arena(
-        controller, terrain, conditions, num_threads=arguments.threads, batch=arguments.robots, supports=supports
-    )
+    arena = _arena(controller, terrain, arguments, supports)
     episodes = protocol_episodes(arena.space, arguments.record, arguments.seed, len(terrain.tiles))
     record_episodes(arena, episodes, folder)
 
