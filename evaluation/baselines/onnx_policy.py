@@ -54,9 +54,11 @@ class OnnxPolicy:
         self.supports = supports_of(card.command, arm_limits)
         self._session = _session(onnx_file)
         self._shapes = {tensor.name: list(tensor.shape) for tensor in self._session.get_inputs()}
+        self._check(onnx_file.name)
         self.batched = all(isinstance(shape[0], str) for shape in self._shapes.values())
         """Whether the graph takes any number of robots at once; otherwise it is run for one after the other."""
-        self._check(onnx_file.name)
+        # Every control step goes by these numbers and not by the names.
+        self._columns = {term: self._joints(term) for entry in card.inputs for term in entry.terms}
         action_scale = np.zeros(len(JOINT_NAMES))
         action_scale[self._acting] = card.action.scale if len(card.action.scale) > 1 else card.action.scale[0]
         self.gains = Gains(stiffness, damping, action_scale)
@@ -121,7 +123,7 @@ class OnnxPolicy:
         kind = TERMS[term.name]
         values = kind.read(seen)
         if kind.per_joint:
-            values = values[:, joint_numbers(term.joints or self.card.observed_joints)]
+            values = values[:, self._columns[term]]
         return (values + term.offset) * torch.tensor(term.scale)
 
     def _run(self, fed: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -156,10 +158,14 @@ class OnnxPolicy:
         """Numbers of one frame of an input."""
         return sum(self._size(term) for term in entry.terms)
 
+    def _joints(self, term: Term) -> list[int]:
+        """Numbers of the joints that a term has, if it has one number for each."""
+        return joint_numbers(term.joints or self.card.observed_joints)
+
     def _size(self, term: Term) -> int:
         kind = TERMS[term.name]
         if kind.per_joint:
-            return len(joint_numbers(term.joints or self.card.observed_joints))
+            return len(self._joints(term))
         if kind.size is not None:
             return kind.size
         if term.name == "last_action":

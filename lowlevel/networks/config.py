@@ -20,7 +20,8 @@ class ObservationSizes:
     elevation_map: int
     """Cells of the elevation map."""
     privileged: int
-    """Numbers the critic sees; the first five are the motion that the history encoder estimates [m/s]."""
+    """Numbers the critic sees; the first five are what the history encoder estimates: velocity [m/s] and capture point
+    [m]."""
     action: int
     """Joints that the policy drives."""
 
