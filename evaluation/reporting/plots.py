@@ -23,11 +23,8 @@ def plot_bars(
     columns: int = 4,
 ) -> None:
     """One panel per quantity, one bar with its interval per case, ``references`` as dashed lines."""
-    rows = -(-len(panels) // columns)
-    canvas, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 2.8 * rows), squeeze=False)
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
-    for axis, (title, bars) in zip(axes.flat, panels.items(), strict=False):
+    canvas, axes = _panels(len(panels), columns, height=2.8)
+    for axis, (title, bars) in zip(axes, panels.items(), strict=False):
         known = [(label, figure) for label, figure in bars.items() if figure.value is not None]
         for place, (_, figure) in enumerate(known):
             value = figure.value or 0.0
@@ -47,18 +44,15 @@ def plot_scatter(
     path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], columns: int = 4
 ) -> None:
     """One panel per quantity, in it one point per episode: ours across, of each other controller upwards."""
-    rows = -(-len(panels) // columns)
-    canvas, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 3.2 * rows), squeeze=False)
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
-    for axis, (title, cases) in zip(axes.flat, panels.items(), strict=False):
+    canvas, axes = _panels(len(panels), columns, height=3.2)
+    for axis, (title, cases) in zip(axes, panels.items(), strict=False):
         for label, (ours, theirs) in cases.items():
             axis.scatter(ours, theirs, s=6, alpha=0.5, label=label)
         largest = np.nanmax([0.0, *(np.nanmax(values, initial=0.0) for pair in cases.values() for values in pair)])
         axis.plot([0.0, largest], [0.0, largest], color="black", linewidth=1)
         axis.set_title(title, fontsize=10)
         axis.set_xlabel("ours", fontsize=8)
-    axes.flat[0].legend(fontsize=8)
+    axes[0].legend(fontsize=8)
     _save(canvas, path)
 
 
@@ -71,11 +65,8 @@ def plot_curves(
     columns: int = 4,
 ) -> None:
     """One panel per column of ``curves`` (T, panels) over ``time`` (T,)."""
-    rows = -(-len(titles) // columns)
-    canvas, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 2.4 * rows), squeeze=False)
-    for axis in axes.flat[len(titles) :]:
-        axis.set_visible(False)
-    for axis, title, curve in zip(axes.flat, titles, curves.T, strict=False):
+    canvas, axes = _panels(len(titles), columns, height=2.4)
+    for axis, title, curve in zip(axes, titles, curves.T, strict=False):
         axis.plot(time, curve, linewidth=1)
         axis.set_title(title, fontsize=10)
         axis.set_xlabel(label, fontsize=8)
@@ -87,16 +78,13 @@ def plot_overlays(
     path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], label: str, columns: int = 4
 ) -> None:
     """One panel per title, in it one named curve (x (T,), y (T,)) per case; cases keep their colors."""
-    rows = -(-len(panels) // columns)
-    canvas, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, 2.6 * rows), squeeze=False)
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
-    for axis, (title, curves) in zip(axes.flat, panels.items(), strict=False):
+    canvas, axes = _panels(len(panels), columns, height=2.6)
+    for axis, (title, curves) in zip(axes, panels.items(), strict=False):
         for name, (x, y) in curves.items():
             axis.plot(x, y, linewidth=1, label=name)
         axis.set_title(title, fontsize=10)
         axis.set_xlabel(label, fontsize=8)
-    axes.flat[0].legend(fontsize=7)
+    axes[0].legend(fontsize=7)
     _save(canvas, path)
 
 
@@ -130,6 +118,15 @@ def plot_heat_map(
     axis.set_title(title, fontsize=10)
     canvas.colorbar(image)
     _save(canvas, path)
+
+
+def _panels(count: int, columns: int, height: float) -> tuple[pyplot.Figure, list[pyplot.Axes]]:
+    """A canvas of ``count`` panels, each ``height`` [in] high, in rows of ``columns``."""
+    rows = -(-count // columns)
+    canvas, axes = pyplot.subplots(rows, columns, figsize=(3.2 * columns, height * rows), squeeze=False)
+    for axis in axes.flat[count:]:
+        axis.set_visible(False)
+    return canvas, list(axes.flat[:count])
 
 
 def _save(canvas: pyplot.Figure, path: Path) -> None:
