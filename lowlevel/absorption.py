@@ -1,8 +1,9 @@
 """Cloning a policy and the gait prior under it into the policy alone.
 
-The prior is a function of what the policy sees (clock and slewed velocity), so the sum of both is a policy, too. The
-student acts in the world without prior, and imitates what teacher and prior would do there (DAgger, Ross et al.,
-AISTATS 2011). A fade of the prior costs speed faster than PPO can take it over; this costs minutes and no skill.
+The prior is a function of what the policy sees or estimates (clock, slewed velocity and capture point), so the sum of
+both is a policy, too. The student acts in the world without prior, and imitates what teacher and prior would do there
+(DAgger, Ross et al., AISTATS 2011). A fade of the prior costs speed faster than PPO can take it over; this costs
+minutes and no skill.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def absorb_prior(
             history = seen_now["history"].view(robots, frames, FRAME_SIZE)
             seen = history.clone()
             seen[:, :, last_action] -= offsets
-            offset = (weight * environment.prior(environment.buffers.reference) / environment.action_scale).to(device)
+            offset = (weight * environment.prior_offset() / environment.action_scale).to(device)
             with torch.no_grad():
                 context = (seen_now["elevation_map"], seen_now["flag"])
                 label = teacher(seen.flatten(1), *context).mean + offset

@@ -31,6 +31,7 @@ class Buffers:
     foot_contact_time: Tensor
     hand_force: Tensor
     mean_velocity_error: Tensor
+    capture_point: Tensor
 
     @classmethod
     def empty(cls, neutral: Tensor) -> Buffers:
@@ -55,4 +56,5 @@ class Buffers:
             foot_contact_time=zeros(2),
             hand_force=zeros(2, 3),
             mean_velocity_error=zeros(3),
+            capture_point=zeros(2),
         )

@@ -178,7 +178,7 @@ class PilotEnvironment:
         nominal_target = self.reference.joint_targets(buffers.reference)
         target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
         if self.config.gait_prior > 0.0:
-            target = target + self.config.gait_prior * self.prior(buffers.reference)
+            target = target + self.config.gait_prior * self.prior_offset()
         measured = self.world.advance(self.randomizer.delayed(target))
         ground = self._seen_ground(measured)
         if self.config.gait_prior > 0.0:
@@ -242,6 +242,11 @@ class PilotEnvironment:
         self.buffers.command[ids] = self.reference.clamp(command)
         self.buffers.flag[ids] = flag
         self.buffers.command_countdown[ids] = torch.inf
+
+    def prior_offset(self) -> Tensor:
+        """What the gait prior would add to the joint targets now (N, 29) [rad]."""
+        buffers = self.buffers
+        return self.prior(buffers.reference, buffers.capture_point, buffers.mean_velocity_error)
 
     # -- parts of a step --------------------------------------------------------------------------------------
 
@@ -332,7 +337,7 @@ class PilotEnvironment:
         buffers, view = self.buffers, self._view(measured, ground)
         noise = self._noise * self._uniform(-1.0, 1.0, self.num_robots, len(self._noise))
         frame = build(FRAME, replace(view, proprioception=view.proprioception.with_noise(noise)))
-        buffers.history = push_history(buffers.history, frame)
+        buffers.history, buffers.capture_point = push_history(buffers.history, frame), measured.capture_point
         if len(new_episodes):
             buffers.history[new_episodes] = start_history(frame[new_episodes])
         if self._step_count % MAP_REFRESH_STEPS == 0:

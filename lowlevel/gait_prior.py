@@ -1,9 +1,12 @@
-"""A bare gait that shows an untrained policy what stepping is; it exists in training only.
+"""A bare gait that shows an untrained policy what stepping and standing are; it exists in training only.
 
-No feedback, three motions: the swing leg lifts, the pelvis shifts over the stance foot, and the legs stride. The
-stride is fitted to the speed that is told while the robot learns: a prior that walks at half of it leaves a policy that
-walks at half of it, long after the prior has gone, because the tracking rewards are flat far from their goal. When the
-robot walks, policy and prior are cloned into the policy alone (:mod:`lowlevel.absorption`).
+Three motions: the swing leg lifts, the pelvis shifts over the stance foot, and the legs stride. Two answers: at a stand
+the legs press against the capture point, because motors that hold a pose at their gains do not hold the robot, and the
+stance ankle presses against a wrong speed. PPO finds such answers too, but takes tens of millions of steps.
+
+The stride is fitted to the speed that is told while the robot learns: a prior that walks at half of it leaves a policy
+that walks at half of it, long after the prior has gone, because the tracking rewards are flat far from their goal. When
+the robot walks, policy and prior are cloned into the policy alone (:mod:`lowlevel.absorption`).
 """
 
 from __future__ import annotations
@@ -15,9 +18,11 @@ from torch import Tensor
 
 from lowlevel.commands import VELOCITY
 from lowlevel.control.reference import ReferenceState
+from lowlevel.control.stepping import FARTHEST
 from lowlevel.runs.distributed import sum_over_ranks
 from robots.g1.constants import NUM_JOINTS, joint_index
 
+_PRESS = {"ankle_pitch": 1.0, "knee": 0.25, "hip_pitch": 0.2}
 _ROWS: tuple[dict[str, float], ...] = (
     # Lift of the left foot, of the right foot: the knee flexes, hip and ankle take half of it back.
     {"left_hip_pitch": -0.5, "left_knee": 1.0, "left_ankle_pitch": -0.5},
@@ -30,6 +35,10 @@ _ROWS: tuple[dict[str, float], ...] = (
     {"left_hip_yaw": -1.0, "right_hip_yaw": 1.0},
     # Feet closer to each other, and level.
     {"left_hip_roll": -1.0, "right_hip_roll": 1.0, "left_ankle_roll": 1.0, "right_ankle_roll": -1.0},
+    # Both legs press the weight back from the toes; the left ankle alone, the right one.
+    {f"{side}_{joint}": share for side in ("left", "right") for joint, share in _PRESS.items()},
+    {"left_ankle_pitch": 1.0},
+    {"right_ankle_pitch": 1.0},
 )
 
 
@@ -48,12 +57,16 @@ class GaitPriorConfig:
     0.7 m long, which makes 0.22; loaded hips follow short of it."""
     stride_lead: float = 0.7
     """Phase by which the stride leads the gait clock, because loaded hips follow late [rad]."""
+    balance: float = 8.0
+    """Ankle pitch at a stand per distance by which the capture point lies ahead of the feet [rad/m]."""
+    braking: float = 0.3
+    """Ankle pitch of the stance leg per m/s by which the robot walks too fast [rad]."""
     fitting_rate: float = 0.06
     """Share of the stride's error that one update takes back."""
 
 
 class GaitPrior:
-    """The prior as a function of the reference alone, and the fit of its stride.
+    """The prior as a function of reference and motion, and the fit of its stride.
 
     ``stride`` (3, 4): amplitudes of the three strides per told (vx, vy, yaw rate, 1). The last column is a creep: what
     the robot walks when it is told to mark time.
@@ -70,16 +83,24 @@ class GaitPrior:
         self._told_told = torch.zeros(4, 4, device=device)
         self._told_walked = torch.zeros(4, 3, device=device)
 
-    def __call__(self, state: ReferenceState) -> Tensor:
-        """Offsets of the joint targets (N, 29) [rad]; zero while standing."""
+    def __call__(self, state: ReferenceState, capture_point: Tensor, velocity_error: Tensor) -> Tensor:
+        """Offsets of the joint targets (N, 29) [rad].
+
+        ``capture_point`` (N, 2) [m], from the middle between the feet, and running mean of the ``velocity_error`` (N,
+        3) [m/s, m/s, rad/s], heading frame.
+        """
         config, sine = self.config, torch.sin(state.phase)
         # The square lets the foot come to rest as it lands.
         lift = config.lift * torch.stack([sine, -sine], dim=1).clamp_min(0.0).square()
         swing = torch.cos(state.phase + config.stride_lead)[:, None]
         stride = swing * (_with_one(state.command[:, VELOCITY]) @ self.stride.T)
         narrowing = torch.full_like(swing, config.narrowing)
-        amounts = torch.cat([lift, config.shift * sine[:, None], stride, narrowing], dim=1)
-        return (amounts * state.walking[:, None]) @ self._rows
+        # Beyond FARTHEST the robot steps.
+        balance = config.balance * capture_point[:, :1].clamp(-FARTHEST, FARTHEST) * ~state.walking[:, None]
+        stance = torch.stack([sine < 0.0, sine > 0.0], dim=1)
+        braking = config.braking * velocity_error[:, :1].clamp(-1.0, 1.0) * stance
+        gait = torch.cat([lift, config.shift * sine[:, None], stride, narrowing], dim=1) * state.walking[:, None]
+        return torch.cat([gait, balance, braking], dim=1) @ self._rows
 
     def observe(self, told: Tensor, walked: Tensor) -> None:
         """Take in the velocities that robots were told and walked at, each (n, 3) in the heading frame."""

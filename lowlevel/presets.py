@@ -157,8 +157,8 @@ STAGES = (
         above=1500.0,
         least_steps=15_000_000,  # at first, in what is open by then, robots seldom fall
         most_steps=60_000_000,
-        std=(0.05, 0.1),
-        mixture=(("steer", 0.1), ("stand", 0.1), ("stand_and_work", 0.4), ("walk_and_work", 0.4)),
+        std=(0.07, 0.15),
+        mixture=(("steer", 0.2), ("stand", 0.05), ("stand_and_work", 0.4), ("walk_and_work", 0.35)),
         rewards=STEPPING,
         randomization=GENTLE,
     ),

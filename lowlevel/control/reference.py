@@ -34,17 +34,17 @@ from robots.g1.nominal_pose import NominalPose
 class ReferenceConfig:
     """How fast the command is followed, and how fast the robot steps."""
 
-    gait_frequency: float = 1.6
+    gait_frequency: float = 2.0
     """Steps of one foot per second [Hz]."""
     velocity_rate: float = 2.5
     """Slew rate of the velocity away from zero [m/s^2] and [rad/s^2]."""
     braking_rate: float = 1.5
     """Slew rate of the velocity towards zero [m/s^2] and [rad/s^2]: it takes two steps to stop."""
-    height_rate: float = 0.6
+    height_rate: float = 0.4
     """Slew rate of the base height [m/s]."""
-    torso_rate: tuple[float, float, float] = (1.2, 1.2, 2.0)
+    torso_rate: tuple[float, float, float] = (0.8, 0.8, 1.5)
     """Slew rates of the torso's roll, pitch and yaw [rad/s]; yaw hardly moves the center of mass."""
-    arm_rate: float = 5.0
+    arm_rate: float = 2.5
     """Slew rate of the arm joints [rad/s]."""
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-FARTHEST = 0.15
+FARTHEST = 0.12
 """Distance of the capture point from the middle between the soles at which a robot steps [m]. Robots that stay up in
 any posture are below 98 % of the time; half of those that fall are beyond for the last 0.7 s."""
 

@@ -125,14 +125,20 @@ def test_arm_targets_lead_by_what_gravity_would_make_them_sag(reference: Referen
     np.testing.assert_allclose(torque, data.qfrc_bias[6 + 15 :], atol=2e-3)
 
 
-def test_the_prior_is_still_while_standing_and_its_legs_take_turns(reference: Reference, space: CommandSpace) -> None:
-    prior = GaitPrior(GaitPriorConfig())
+def test_the_priors_legs_take_turns_and_its_ankles_answer_at_a_stand(reference: Reference, space: CommandSpace) -> None:
+    prior, centered, as_told = GaitPrior(GaitPriorConfig()), torch.zeros(2, 2), torch.zeros(2, 3)
     command = space.neutral().repeat(2, 1)
     command[:, VELOCITY] = torch.tensor([0.6, 0.0, 0.0])
-    assert (prior(ReferenceState.standing(command)) == 0.0).all()
-    halves = prior(ReferenceState(command, torch.tensor([1.0, 1.0 + math.pi])))
+    assert (prior(ReferenceState.standing(command), centered, as_told + 0.1) == 0.0).all()
+    topples = prior(ReferenceState.standing(command), torch.tensor([[0.1, 0.0], [0.0, 0.1]]), as_told)
+    ankles = [joint_index(f"{side}_ankle_pitch_joint") for side in ("left", "right")]
+    assert topples[0, ankles].tolist() == pytest.approx([0.1 * GaitPriorConfig().balance] * 2)
+    assert topples[0].count_nonzero() == 6 and topples[1].count_nonzero() == 0
+    halves = prior(ReferenceState(command, torch.tensor([1.0, 1.0 + math.pi])), centered + 0.1, as_told)
     np.testing.assert_allclose(halves[1].numpy(), JOINTS_MIRROR(halves[0].numpy()), atol=1e-6)
-    middle = prior(ReferenceState(command[:1], torch.tensor([math.pi / 2])))[0]
+    middle = prior(ReferenceState(command[:1], torch.tensor([math.pi / 2])), centered[:1], as_told[:1])[0]
     assert middle[joint_index("left_knee_joint")].item() == pytest.approx(GaitPriorConfig().lift)
     assert middle[joint_index("right_knee_joint")].item() == 0.0
+    too_fast = prior(ReferenceState(command, torch.tensor([1.0, 1.0 + math.pi])), centered, as_told + 0.1) - halves
+    assert too_fast.nonzero().tolist() == [[0, ankles[1]], [1, ankles[0]]] and (too_fast >= 0.0).all()
     assert halves.shape == (2, NUM_JOINTS)

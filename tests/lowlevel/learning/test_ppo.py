@@ -22,6 +22,7 @@ from small_learner import (
 from lowlevel.learning.learner import adapted_rate, clipped_surrogate
 from lowlevel.learning.ppo import PPO, NonFiniteError, PPOConfig
 from lowlevel.learning.symmetry import TensorMirrors
+from lowlevel.networks.actor import CAPTURE_POINT, MOTION_SIZE
 
 FAST = {"critic_learning_rate": 2e-3, "actor_learning_rate": 1e-3, "initial_std": 0.3}
 
@@ -213,23 +214,27 @@ def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
     assert float(deviations.min()) > 0.2999 and float(deviations.max()) < 0.4001
 
 
-def test_gait_noise_has_unit_variance_and_repeats_with_the_clock() -> None:
+def test_the_pattern_in_the_noise_has_unit_variance_and_answers_clock_and_capture_point() -> None:
     robots = 4096
-    ppo = make_ppo(robots, gait_noise_share=1.0, gait_noise_steps=1e9)
+    ppo = make_ppo(robots, pattern_share=1.0, pattern_steps=1e9)
     ppo.gait_clock = slice(0, 2)
 
-    def noise(phase: float | None) -> torch.Tensor:
-        frame = torch.zeros(robots, SIZES.frame)
+    def noise(phase: float | None, topples: float = 0.0) -> torch.Tensor:
+        frame, motion = torch.zeros(robots, SIZES.frame), torch.zeros(robots, MOTION_SIZE)
         if phase is not None:
             frame[:, 0], frame[:, 1] = math.sin(phase), math.cos(phase)
-        return ppo._noise(frame)
+        motion[:, CAPTURE_POINT] = torch.tensor([topples, 0.0])
+        return ppo._noise(frame, motion)
 
     first, half, again, still = noise(0.4), noise(0.4 + math.pi), noise(0.4), noise(None)
     assert torch.equal(first, again) and not torch.allclose(first, half)
     torch.testing.assert_close(noise(None), still)
-    for pattern in (first, half, still):
+    forwards, backwards = noise(None, 0.1), noise(None, -0.1)
+    assert torch.equal(forwards, noise(None, 0.2)) and not torch.allclose(forwards, backwards)
+    torch.testing.assert_close(forwards + backwards, still * 2.0**0.5)
+    for pattern in (first, half, still, forwards):
         torch.testing.assert_close(pattern.std(dim=0), torch.ones(SIZES.action), rtol=0.05, atol=0.0)
-    ppo.config = dataclasses.replace(ppo.config, gait_noise_share=0.5)
+    ppo.config = dataclasses.replace(ppo.config, pattern_share=0.5)
     assert torch.corrcoef(torch.stack([noise(0.4)[:, 0], first[:, 0]]))[0, 1] == pytest.approx(0.5**0.5, abs=0.05)
 
 
