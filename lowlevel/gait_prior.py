@@ -52,10 +52,10 @@ class GaitPriorConfig:
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
     narrowing: float = 0.04
     """Hip roll that brings the feet closer to each other than the hips are [rad]: the pelvis sways less."""
-    stride: tuple[float, float, float] = (0.35, 0.3, 0.25)
+    stride: tuple[float, float, float] = (0.35, 0.4, 0.15)
     """First hip swing per told vx, vy [rad per m/s] and yaw rate [rad per rad/s]. Half a stride is v T / 4 and the leg
-    0.7 m long, which makes 0.22; loaded hips follow short of it."""
-    stride_lead: float = 0.7
+    0.7 m long, which makes 0.18; loaded hips follow short of it."""
+    stride_lead: float = 1.0
     """Phase by which the stride leads the gait clock, because loaded hips follow late [rad]."""
     balance: float = 8.0
     """Ankle pitch at a stand per distance by which the capture point lies ahead of the feet [rad/m]."""

@@ -44,7 +44,7 @@ class ReferenceConfig:
     """Slew rate of the base height [m/s]."""
     torso_rate: tuple[float, float, float] = (0.8, 0.8, 1.5)
     """Slew rates of the torso's roll, pitch and yaw [rad/s]; yaw hardly moves the center of mass."""
-    arm_rate: float = 2.5
+    arm_rate: float = 4.0
     """Slew rate of the arm joints [rad/s]."""
 
 
