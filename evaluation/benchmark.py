@@ -140,7 +140,7 @@ def _training(preset: str, arguments: Arguments) -> TrainingConfig:
     """The training of a preset with the benchmark's robots and cores, in its first stage without a gait prior."""
     config = PRESETS[preset]
     environment = replace(config.environment, num_robots=arguments.robots, num_threads=arguments.cores)
-    first = next(stage for stage in config.stages if stage.gait_prior == 0.0)
+    first = next(stage for stage in config.stages if stage.prior is None)
     return replace(config, environment=environment, stages=(first,))
 
 

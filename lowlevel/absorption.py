@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lowlevel.control.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, columns
 from lowlevel.environment import PilotEnvironment
+from lowlevel.gait_prior import GaitPrior
 from lowlevel.learning.ppo import PPO
 from lowlevel.runs.distributed import average_over_ranks
 from robots.g1.constants import NUM_JOINTS
@@ -53,9 +54,9 @@ def _mirrored(ppo: PPO, observation: dict[str, Tensor], label: Tensor) -> tuple[
 
 
 def absorb_prior(
-    ppo: PPO, environment: PilotEnvironment, weight: float, config: AbsorptionConfig, report: Callable[[str], None]
+    ppo: PPO, environment: PilotEnvironment, prior: GaitPrior, config: AbsorptionConfig, report: Callable[[str], None]
 ) -> dict[str, Tensor]:
-    """Teach the actor of ``ppo`` to act in ``environment``, which has no prior, as it did under ``weight`` of it.
+    """Teach the actor of ``ppo`` to act in ``environment``, which has no prior, as it did under ``prior``.
 
     ``report`` is told how it goes, a line a round. Returns the observation to go on from.
     """
@@ -77,7 +78,9 @@ def absorb_prior(
             history = seen_now["history"].view(robots, frames, FRAME_SIZE)
             seen = history.clone()
             seen[:, :, last_action] -= offsets
-            offset = (weight * environment.prior_offset() / environment.action_scale).to(device)
+            state = environment.buffers
+            offset = prior(state.reference, state.capture_point, state.mean_velocity_error)
+            offset = (offset / environment.action_scale).to(device)
             with torch.no_grad():
                 context = (seen_now["elevation_map"], seen_now["flag"])
                 label = teacher(seen.flatten(1), *context).mean + offset

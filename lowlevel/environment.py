@@ -75,14 +75,13 @@ class EnvironmentConfig:
     """Share of episodes that start at the commanded velocity."""
     action_limit: float = 12.0
     """Actions are clipped to +- this many action scales; the lift of a knee takes 10."""
-    prior: GaitPriorConfig = field(default_factory=GaitPriorConfig)
-    reference: ReferenceConfig = field(default_factory=ReferenceConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     # What the stages of a training run set (lowlevel.stages)
+    reference: FromStage[ReferenceConfig] = field(default_factory=ReferenceConfig)
     arms_act: FromStage[bool] = True
     """Whether the policy corrects the arms too; their targets are the slewed command otherwise."""
-    gait_prior: FromStage[float] = 0.0
-    """Weight of the gait prior; 0 in everything that is evaluated or deployed."""
+    prior: FromStage[GaitPriorConfig | None] = None
+    """The gait prior; none in everything that is evaluated or deployed."""
     mixture: FromStage[Mixture] = PROTOCOL
     """Kinds of command and their shares."""
     terrain: FromStage[TerrainConfig] = field(default_factory=TerrainConfig)
@@ -136,7 +135,7 @@ class PilotEnvironment:
         self.command_space = command_space(lower.tolist(), upper.tolist())
         self.sampler = CommandSampler(self.command_space, device)
         self.reference = Reference(config.reference, gains, self.control_period, device)
-        self.prior = GaitPrior(config.prior, device)
+        self.prior = None if config.prior is None else GaitPrior(config.prior, device)
         self.action_scale = torch.tensor(gains.action_scale, dtype=torch.float32, device=device)
         self.randomizer = Randomizer(config.randomization, self.simulation, self.generator)
         self.kind_probability = shares(config.mixture, device)
@@ -177,11 +176,11 @@ class PilotEnvironment:
             action[:, ARM_JOINTS] = 0.0
         nominal_target = self.reference.joint_targets(buffers.reference)
         target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
-        if self.config.gait_prior > 0.0:
-            target = target + self.config.gait_prior * self.prior_offset()
+        if self.prior is not None:
+            target += self.prior(buffers.reference, buffers.capture_point, buffers.mean_velocity_error)
         measured = self.world.advance(self.randomizer.delayed(target))
         ground = self._seen_ground(measured)
-        if self.config.gait_prior > 0.0:
+        if self.prior is not None:
             walks = is_walking(buffers.reference.command) & (buffers.episode_step > UNDER_WAY)
             walked = torch.cat([measured.linear_velocity[:, :2], measured.yaw_rate[:, None]], dim=1)
             self.prior.observe(buffers.reference.command[walks, VELOCITY], walked[walks])
@@ -242,11 +241,6 @@ class PilotEnvironment:
         self.buffers.command[ids] = self.reference.clamp(command)
         self.buffers.flag[ids] = flag
         self.buffers.command_countdown[ids] = torch.inf
-
-    def prior_offset(self) -> Tensor:
-        """What the gait prior would add to the joint targets now (N, 29) [rad]."""
-        buffers = self.buffers
-        return self.prior(buffers.reference, buffers.capture_point, buffers.mean_velocity_error)
 
     # -- parts of a step --------------------------------------------------------------------------------------
 

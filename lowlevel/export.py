@@ -46,7 +46,7 @@ def export_controller(trainer: Trainer, folder: Path, revision: str | None = Non
     Raises:
         PilotError: if the run is in a stage with a gait prior, which no controller has.
     """
-    if trainer.stage.gait_prior > 0.0:
+    if trainer.stage.prior is not None:
         raise PilotError(f"the policy still leans on the gait prior in the stage {trainer.stage.name!r}: train on")
     environment = trainer.environment
     config, pose = controller_config(environment), environment.reference.pose

@@ -1,8 +1,8 @@
 """A bare gait that shows an untrained policy what stepping and standing are; it exists in training only.
 
 Three motions: the swing leg lifts, the pelvis shifts over the stance foot, and the legs stride. Two answers: at a stand
-the legs press against the capture point, because motors that hold a pose at their gains do not hold the robot, and the
-stance ankle presses against a wrong speed. PPO finds such answers too, but takes tens of millions of steps.
+the legs press against the capture point, because motors that hold a pose at their gains do not hold the robot; while it
+walks the stance leg presses against a wrong speed. PPO finds such answers too, but takes tens of millions of steps.
 
 The stride is fitted to the speed that is told while the robot learns: a prior that walks at half of it leaves a policy
 that walks at half of it, long after the prior has gone, because the tracking rewards are flat far from their goal. When
@@ -35,32 +35,36 @@ _ROWS: tuple[dict[str, float], ...] = (
     {"left_hip_yaw": -1.0, "right_hip_yaw": 1.0},
     # Feet closer to each other, and level.
     {"left_hip_roll": -1.0, "right_hip_roll": 1.0, "left_ankle_roll": 1.0, "right_ankle_roll": -1.0},
-    # Both legs press the weight back from the toes; the left ankle alone, the right one.
+    # Both legs press the weight back from the toes; each ankle alone; each hip turns the pelvis back.
     {f"{side}_{joint}": share for side in ("left", "right") for joint, share in _PRESS.items()},
     {"left_ankle_pitch": 1.0},
     {"right_ankle_pitch": 1.0},
+    {"left_hip_yaw": 1.0},
+    {"right_hip_yaw": 1.0},
 )
 
 
 @dataclass(frozen=True)
 class GaitPriorConfig:
-    """Size of the prior's rows."""
+    """Size of the prior's motions and answers."""
 
-    lift: float = 1.2
+    lift: float = 0.9
     """Knee flexion at mid-swing [rad]."""
     shift: float = 0.06
     """Amplitude of the hip roll that moves the pelvis over the stance foot [rad]."""
     narrowing: float = 0.04
     """Hip roll that brings the feet closer to each other than the hips are [rad]: the pelvis sways less."""
-    stride: tuple[float, float, float] = (0.35, 0.4, 0.15)
+    stride: tuple[float, float, float] = (0.4, 0.4, 0.2)
     """First hip swing per told vx, vy [rad per m/s] and yaw rate [rad per rad/s]. Half a stride is v T / 4 and the leg
-    0.7 m long, which makes 0.18; loaded hips follow short of it."""
-    stride_lead: float = 1.0
+    0.7 m long, which makes 0.22; loaded hips follow short of it."""
+    stride_lead: float = 0.8
     """Phase by which the stride leads the gait clock, because loaded hips follow late [rad]."""
     balance: float = 8.0
     """Ankle pitch at a stand per distance by which the capture point lies ahead of the feet [rad/m]."""
     braking: float = 0.3
     """Ankle pitch of the stance leg per m/s by which the robot walks too fast [rad]."""
+    turning_back: float = 0.0
+    """Hip yaw of the stance leg per rad/s by which the robot turns too fast [rad]."""
     fitting_rate: float = 0.06
     """Share of the stride's error that one update takes back."""
 
@@ -98,9 +102,10 @@ class GaitPrior:
         # Beyond FARTHEST the robot steps.
         balance = config.balance * capture_point[:, :1].clamp(-FARTHEST, FARTHEST) * ~state.walking[:, None]
         stance = torch.stack([sine < 0.0, sine > 0.0], dim=1)
-        braking = config.braking * velocity_error[:, :1].clamp(-1.0, 1.0) * stance
+        forwards, _, turning = velocity_error.clamp(-1.0, 1.0).split(1, dim=1)
+        answers = [config.braking * forwards * stance, config.turning_back * turning * stance]
         gait = torch.cat([lift, config.shift * sine[:, None], stride, narrowing], dim=1) * state.walking[:, None]
-        return torch.cat([gait, balance, braking], dim=1) @ self._rows
+        return torch.cat([gait, balance, *answers], dim=1) @ self._rows
 
     def observe(self, told: Tensor, walked: Tensor) -> None:
         """Take in the velocities that robots were told and walked at, each (n, 3) in the heading frame."""
@@ -127,8 +132,10 @@ class GaitPrior:
         self.stride = first + (self.stride + change - first).clamp(-0.5 * scale, 0.5 * scale)
 
 
-def first_stride(config: GaitPriorConfig) -> Tensor:
-    """The stride (3, 4) before any fit."""
+def first_stride(config: GaitPriorConfig | None) -> Tensor:
+    """The stride (3, 4) before any fit; zero without prior."""
+    if config is None:
+        return torch.zeros(3, 4)
     return torch.cat([torch.tensor(config.stride).diag(), torch.zeros(3, 1)], dim=1)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from lowlevel.commands import PROTOCOL, Mixture
 from lowlevel.environment import EnvironmentConfig
+from lowlevel.gait_prior import GaitPriorConfig
 from lowlevel.rewards import RewardWeights
 from lowlevel.world.randomization import RandomizationConfig
 from lowlevel.world.terrain import TerrainConfig
@@ -30,8 +31,10 @@ class Stage:
     """Environment steps after which the next stage begins all the same."""
     std: tuple[float, float] = (0.05, 0.3)
     """Bounds of the exploration noise [action units]."""
-    gait_prior: float = 0.0
-    """Weight of the gait prior. When a stage without prior follows one with it, the policy absorbs the prior first."""
+    gait_frequency: float = 2.0
+    """Steps of one foot per second [Hz]."""
+    prior: GaitPriorConfig | None = None
+    """What a gait prior adds to the policy's targets. When a stage without one follows, the policy absorbs it first."""
     fits_prior: bool = False
     """Whether the prior's stride comes to fit the told velocity: not before the robot walks at all."""
     rollout_doublings: int = 0
@@ -52,7 +55,8 @@ class Stage:
         """The task in this stage."""
         return replace(
             base,
-            gait_prior=self.gait_prior,
+            reference=replace(base.reference, gait_frequency=self.gait_frequency),
+            prior=self.prior,
             arms_act=self.arms_act,
             mixture=self.mixture,
             terrain=self.terrain,

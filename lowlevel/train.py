@@ -62,7 +62,7 @@ def _run(arguments: list[str]) -> None:
         trainer.train()
         if distributed.rank() == 0:
             outcome = f"no controller yet: the stage {trainer.stage.name!r} has a gait prior"
-            if trainer.stage.gait_prior == 0.0:
+            if trainer.stage.prior is None:
                 export_controller(trainer, trainer.run.path / "controller")
                 outcome = f"the controller lies in {trainer.run.path / 'controller'}"
             print(f"{trainer.steps} steps in {trainer.trained_seconds / 3600:.2f} h; {outcome}")

@@ -117,7 +117,7 @@ class Trainer:
         self.trained_seconds = 0.0
         self.fall_rate = 0.05
         self.observation: dict[str, Tensor] = {}
-        self.stride = first_stride(config.environment.prior)
+        self.stride = first_stride(config.stages[0].prior)
         self._stop_requested = False
         self._begin_stage(0)
 
@@ -131,7 +131,8 @@ class Trainer:
         stage = self.stage
         seed = self.config.seed + 7919 * rank() + 104729 * number
         self.environment = PilotEnvironment(stage.environment(self.config.environment), seed=seed, device="cpu")
-        self.environment.prior.stride = self.stride
+        if self.environment.prior is not None:
+            self.environment.prior.stride = self.stride
         self._shares = shares(stage.mixture)
         acting = NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop
         self.ppo.enter(stage.std, acting, stage.rollout_doublings)
@@ -162,11 +163,12 @@ class Trainer:
         if not reached and taken < stage.most_steps:
             return
         self.save()
+        prior, following = self.environment.prior, self.config.stages[self.stage_number + 1]
+        if following.prior != stage.prior:
+            self.stride = first_stride(following.prior)
         self._begin_stage(self.stage_number + 1)
-        if stage.gait_prior > 0.0 and self.stage.gait_prior == 0.0:
-            self.observation = absorb_prior(
-                self.ppo, self.environment, stage.gait_prior, self.config.absorption, report
-            )
+        if prior is not None and self.environment.prior is None:
+            self.observation = absorb_prior(self.ppo, self.environment, prior, self.config.absorption, report)
         else:
             self.observation = self.environment.reset(spread_episodes=True)
 
@@ -228,7 +230,7 @@ class Trainer:
         steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
         self.curriculum.update(hardens=self.stage.harder is not None)
         self._apply_curriculum()
-        if self.stage.fits_prior:
+        if self.stage.fits_prior and self.environment.prior is not None:
             self.environment.prior.fit()
             self.stride = self.environment.prior.stride
         figures = {f"reward/{name}": value for name, value in mean_terms.items()}

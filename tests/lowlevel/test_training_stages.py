@@ -13,6 +13,7 @@ from lowlevel.absorption import AbsorptionConfig, absorb_prior
 from lowlevel.commands import KINDS
 from lowlevel.curriculum import CurriculumConfig
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
+from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
 from lowlevel.learning.ppo import PPOConfig
 from lowlevel.networks.config import NetworkConfig
 from lowlevel.presets import PRESETS
@@ -22,7 +23,7 @@ from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.randomization import RandomizationConfig
 
 QUICK = AbsorptionConfig(rounds=2, steps=4, mixed_rounds=1, gradient_steps=2, minibatch=16)
-FIRST = Stage("first", "reward/alive", above=0.1, least_steps=0, std=(0.2, 0.3), gait_prior=1.0)
+FIRST = Stage("first", "reward/alive", above=0.1, least_steps=0, std=(0.2, 0.3), prior=GaitPriorConfig())
 SECOND = Stage("second", std=(0.05, 0.1), rollout_doublings=1, arms_act=True, mixture=(("walk", 1.0),))
 
 
@@ -38,11 +39,11 @@ def tiny(*stages: Stage) -> TrainingConfig:
 
 def test_the_next_stage_begins_when_its_figure_is_reached(tmp_path: Path) -> None:
     trainer = Trainer(replace(tiny(FIRST, SECOND), total_steps=64 * 4), tmp_path)
-    assert trainer.environment.config.gait_prior == 1.0
+    assert trainer.environment.prior is not None
     trainer.train()
     assert trainer.stage.name == "second"
     environment = trainer.environment
-    assert environment.config.gait_prior == 0.0 and environment.config.arms_act
+    assert environment.prior is None and environment.config.arms_act
     assert set(environment.buffers.kind.tolist()) == {list(KINDS).index("walk")}
     assert trainer.ppo.storage.steps == 16
     assert float(trainer.ppo.actor.log_std.exp().max()) <= 0.1 + 1e-6
@@ -73,18 +74,20 @@ def test_a_resumed_run_goes_on_in_its_stage(tmp_path: Path) -> None:
 def test_absorption_teaches_the_policy_what_the_prior_did(tmp_path: Path) -> None:
     """Walking on the spot by the prior alone: after absorption the policy does the same without it."""
     walking = Stage(
-        "walk", gait_prior=1.0, mixture=(("walk", 1.0),), randomization=RandomizationConfig.for_evaluation()
+        "walk", prior=GaitPriorConfig(), mixture=(("walk", 1.0),), randomization=RandomizationConfig.for_evaluation()
     )
     config = replace(tiny(walking), environment=EnvironmentConfig(num_robots=32, num_threads=1))
     trainer = Trainer(config, tmp_path)
-    alone = PilotEnvironment(replace(trainer.environment.config, gait_prior=0.0), seed=1)
+    alone = PilotEnvironment(replace(trainer.environment.config, prior=None), seed=1)
+    prior = GaitPrior(GaitPriorConfig())
     progress: list[float] = []
     settings = AbsorptionConfig(rounds=12, mixed_rounds=6, minibatch=256, learning_rate=3e-3)
     observation = absorb_prior(
-        trainer.ppo, alone, 1.0, settings, lambda text: progress.append(float(text.split(": ")[1].split(" nat")[0]))
+        trainer.ppo, alone, prior, settings, lambda text: progress.append(float(text.split(": ")[1].split(" nat")[0]))
     )
     assert progress[-1] < 0.3 * progress[0]
-    wanted = alone.prior_offset() / alone.action_scale
+    state = alone.buffers
+    wanted = prior(state.reference, state.capture_point, state.mean_velocity_error) / alone.action_scale
     action = trainer.ppo.deterministic(observation)
     assert torch.isfinite(action).all()
     assert (action - wanted)[:, :15].square().mean() < 0.5 * wanted[:, :15].square().mean()
