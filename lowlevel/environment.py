@@ -18,7 +18,6 @@ from lowlevel.commands import (
     CommandSampler,
     Mixture,
     command_space,
-    is_walking,
     shares,
 )
 from lowlevel.control.observation import (
@@ -45,8 +44,6 @@ from robots.rotations import rotate_about_vertical
 
 AVERAGING = 0.4
 """Time constant of the averaged velocity error [s]: the sway of one step is averaged out, a drift is not."""
-UNDER_WAY = 50
-"""Control steps after a reset from which a robot's velocity says something about its gait."""
 
 Value = TypeVar("Value")
 FromStage = Annotated[Value, tyro.conf.Suppress]
@@ -180,10 +177,6 @@ class PilotEnvironment:
             target += self.prior(buffers.reference, buffers.capture_point, buffers.mean_velocity_error)
         measured = self.world.advance(self.randomizer.delayed(target))
         ground = self._seen_ground(measured)
-        if self.prior is not None:
-            walks = is_walking(buffers.reference.command) & (buffers.episode_step > UNDER_WAY)
-            walked = torch.cat([measured.linear_velocity[:, :2], measured.yaw_rate[:, None]], dim=1)
-            self.prior.observe(buffers.reference.command[walks, VELOCITY], walked[walks])
         buffers.previous_action, buffers.action = buffers.action, action
         buffers.episode_step += 1
         self._update_foot_times(measured)

@@ -36,6 +36,7 @@ a foot that ran into an edge."""
 
 SHAPED = replace(
     TRACKING,
+    feet_stumble=-1.0,
     velocity_progress=4.0,
     foot_phase=3.0,
     foot_placement=5.0,
@@ -77,25 +78,25 @@ slowly."""
 SLABS = TerrainConfig(tiles=("flat", "irregular"), tile_size=8.0)
 """The simple terrain of the paper: flat, and irregular by 2 cm."""
 
-SLOW_STEPS = 1.6
+SLOW_STEPS = 1.43
 """Gait frequency for a robot that learns to walk [Hz]: at 2 Hz the prior's legs, which follow late, turn the pelvis by
 more than 1 rad/s. One that walks falls less the more often it steps."""
 
-ANSWERS = GaitPriorConfig(
-    lift=0.0, shift=0.0, narrowing=0.0, stride=(0.0, 0.0, 0.0), balance=4.0, braking=0.3, turning_back=0.1
-)
+ANSWERS = GaitPriorConfig(lift=0.0, shift=0.0, stride=(0.0, 0.0, 0.0), balance=4.0, braking=0.3, turning_back=0.1)
 """What a robot that walks still lacks in postures that it did not know when it absorbed the first prior."""
 
 STAGES = (
     Stage(
         "balance",
-        waits_for="episode/steps_between_falls",
+        waits_for="curriculum/steps_between_falls/forward",
         above=150.0,
-        most_steps=4_000_000,
+        most_steps=5_000_000,
+        gait_noise=0.0,
+        normalizes_by_kind=False,
         gait_frequency=SLOW_STEPS,
         std=(0.4, 1.0),
         prior=GaitPriorConfig(),
-        mixture=(("forward", 0.3), ("steer", 0.3), ("stand", 0.2), ("squat", 0.2)),
+        mixture=(("forward", 0.5), ("steer", 0.3), ("stand", 0.1), ("squat", 0.1)),
         rewards=SHAPED,
         randomization=GENTLE,
     ),
@@ -104,10 +105,11 @@ STAGES = (
         waits_for="curriculum/opening/forward",
         above=0.95,
         most_steps=6_000_000,
+        gait_noise=0.0,
+        normalizes_by_kind=False,
         gait_frequency=SLOW_STEPS,
         std=(0.05, 0.3),
         prior=GaitPriorConfig(),
-        fits_prior=True,
         mixture=(("forward", 0.5), ("steer", 0.3), ("stand", 0.1), ("squat", 0.1)),
         rewards=SHAPED,
         randomization=GENTLE,
@@ -185,17 +187,28 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
-        "harden",
+        "carry",
         waits_for="curriculum/hardness",
         above=0.98,
+        most_steps=40_000_000,
+        std=(0.05, 0.1),
+        mixture=EVERYTHING,
+        rewards=STEPPING,
+        randomization=GENTLE,
+        harder=HARD,
+    ),
+    Stage(
+        "harden",
+        waits_for="curriculum/steps_between_falls/walk_and_work",
+        above=2000.0,
+        least_steps=5_000_000,
         most_steps=40_000_000,
         std=(0.04, 0.1),
         rollout_doublings=1,
         mixture=EVERYTHING,
         terrain=SLABS,
         rewards=STEPPING,
-        randomization=FIRM,
-        harder=HARD,
+        randomization=HARD,
     ),
     Stage(
         "refine",
@@ -205,8 +218,7 @@ STAGES = (
         mixture=EVERYTHING,
         terrain=SLABS,
         rewards=TRACKING,
-        randomization=FIRM,
-        harder=HARD,
+        randomization=HARD,
     ),
 )
 """From nothing to the controller: balance with a gait prior, walk with it, absorb it, steer, on uneven ground too, then

@@ -35,8 +35,12 @@ class Stage:
     """Steps of one foot per second [Hz]."""
     prior: GaitPriorConfig | None = None
     """What a gait prior adds to the policy's targets. When a stage without one follows, the policy absorbs it first."""
-    fits_prior: bool = False
-    """Whether the prior's stride comes to fit the told velocity: not before the robot walks at all."""
+    gait_noise: float = 0.8
+    """Share of the exploration noise's variance that is a pattern over the gait clock, and constant at a stand: for a
+    robot that improves its gait. One that learns to balance does it in white noise."""
+    normalizes_by_kind: bool = True
+    """Whether advantages are normalized within each kind of command: for kinds that are learned beside some that are
+    mastered already. As long as most robots fall when they walk, that is what is to be learned."""
     rollout_doublings: int = 0
     """Rollouts are 2 to this power times as long as at first: the better the policy, the more samples it takes to see
     what would improve it."""

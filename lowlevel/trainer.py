@@ -24,7 +24,6 @@ from lowlevel.control.observation import (
 )
 from lowlevel.curriculum import Curriculum, CurriculumConfig
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
-from lowlevel.gait_prior import first_stride
 from lowlevel.learning.ppo import PPO, PPOConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes
 from lowlevel.runs.distributed import any_rank, average_over_ranks, rank, world_size
@@ -117,7 +116,6 @@ class Trainer:
         self.trained_seconds = 0.0
         self.fall_rate = 0.05
         self.observation: dict[str, Tensor] = {}
-        self.stride = first_stride(config.stages[0].prior)
         self._stop_requested = False
         self._begin_stage(0)
 
@@ -131,11 +129,9 @@ class Trainer:
         stage = self.stage
         seed = self.config.seed + 7919 * rank() + 104729 * number
         self.environment = PilotEnvironment(stage.environment(self.config.environment), seed=seed, device="cpu")
-        if self.environment.prior is not None:
-            self.environment.prior.stride = self.stride
         self._shares = shares(stage.mixture)
         acting = NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop
-        self.ppo.enter(stage.std, acting, stage.rollout_doublings)
+        self.ppo.enter(stage.std, acting, stage.rollout_doublings, stage.gait_noise, stage.normalizes_by_kind)
         self._apply_curriculum()
         self.observation = {}
 
@@ -163,9 +159,7 @@ class Trainer:
         if not reached and taken < stage.most_steps:
             return
         self.save()
-        prior, following = self.environment.prior, self.config.stages[self.stage_number + 1]
-        if following.prior != stage.prior:
-            self.stride = first_stride(following.prior)
+        prior = self.environment.prior
         self._begin_stage(self.stage_number + 1)
         if prior is not None and self.environment.prior is None:
             self.observation = absorb_prior(self.ppo, self.environment, prior, self.config.absorption, report)
@@ -230,16 +224,10 @@ class Trainer:
         steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
         self.curriculum.update(hardens=self.stage.harder is not None)
         self._apply_curriculum()
-        if self.stage.fits_prior and self.environment.prior is not None:
-            self.environment.prior.fit()
-            self.stride = self.environment.prior.stride
         figures = {f"reward/{name}": value for name, value in mean_terms.items()}
         figures |= {f"tracking/{name}": value for name, value in tracking.take().items()}
         figures |= {f"curriculum/{name}": value for name, value in self.curriculum.figures(self._shares).items()}
         figures["curriculum/stage"] = float(self.stage_number)
-        if self.stage.fits_prior:
-            strides = zip(("forwards", "sideways", "turning"), self.stride.diagonal().tolist(), strict=True)
-            figures |= {f"prior/{name}": stride for name, stride in strides}
         figures |= {f"learner/{name}": value for name, value in losses.items()}
         figures["episode/steps_between_falls"] = steps_between_falls
         figures["speed/collection_seconds"] = collection_seconds
@@ -257,7 +245,6 @@ class Trainer:
             "steps": self.steps,
             "trained_seconds": self.trained_seconds,
             "fall_rate": self.fall_rate,
-            "stride": self.stride,
             "action_scale": self.environment.action_scale.cpu(),
             "stage": self.stage_number,
             "stage_begin": self.stage_begin,
@@ -298,7 +285,6 @@ class Trainer:
             ) from error
         self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
         self.fall_rate = float(state["fall_rate"])
-        self.stride = state["stride"]
         self._begin_stage(int(state["stage"]))
         self.stage_begin, self.waited_for = int(state["stage_begin"]), float(state["waited_for"])
         if with_environment and rank() == 0 and "environment" in state:

@@ -72,9 +72,7 @@ class PPOConfig:
     """First standard deviation of the exploration noise [action units]; the stages of a run bound it."""
     max_grad_norm: float = 1.0
     """Gradient norm to which each of the three groups is clipped."""
-    pattern_share: float = 0.8
-    """Share of the exploration noise's variance that is a pattern over the gait clock and the capture point."""
-    pattern_steps: float = 100.0
+    gait_noise_steps: float = 100.0
     """Control steps for which a robot keeps its pattern, on average."""
     mirror_loss_weight: float = 0.1
     """Weight of the symmetry loss, the KL divergence between the policy and its mirror image [1/nat]; 0: none."""

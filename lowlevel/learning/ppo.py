@@ -14,13 +14,12 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributions import kl_divergence
-from torch.nn import functional
 
 from lowlevel.learning.estimation import ESTIMATED
 from lowlevel.learning.learner import ACTOR_KEYS, POLICY_KEYS, Learner, PPOConfig
 from lowlevel.learning.rollout import RolloutStorage, generalized_advantages, normalized_by_task
 from lowlevel.learning.symmetry import TensorMirrors
-from lowlevel.networks.actor import CAPTURE_POINT, MOTION_SIZE, NetworkConfig, ObservationSizes
+from lowlevel.networks.actor import MOTION_SIZE, NetworkConfig, ObservationSizes
 from lowlevel.runs.checks import NonFiniteError, require_finite
 from lowlevel.runs.distributed import rank
 from robots.errors import PilotError
@@ -29,8 +28,6 @@ from robots.g1.mirror import Mirror
 __all__ = ["PPO", "NonFiniteError", "PPOConfig"]
 
 OBSERVATION_KEYS = (*ACTOR_KEYS, "privileged")
-TOPPLING = 0.05
-"""Distance of the capture point from the feet at which the exploration noise answers it fully [m]."""
 
 
 class PPO:
@@ -96,8 +93,9 @@ class PPO:
         self._shapes = shapes
         self.gait_clock = gait_clock
         self.tasks = tasks
-        self._pattern = torch.zeros(num_envs, sizes.action, 5, device=self.device)
-        """Each robot's own answer of every action to a constant, the gait clock (2) and the capture point (2)."""
+        self.gait_noise_share, self.normalizes_by_task = 0.0, False
+        self._gait_noise = torch.zeros(num_envs, sizes.action, 3, device=self.device)
+        """Constant, sine and cosine part of each robot's pattern."""
         self.storage = self._room_for(config.steps_per_update, num_envs)
         if self.storage.size % config.minibatches:
             raise PilotError(
@@ -126,7 +124,7 @@ class PPO:
         """
         observation = {key: observation[key].to(self.device) for key in OBSERVATION_KEYS}
         output = self.learner.policy(observation)
-        action = output.mean + self.actor.log_std.exp() * self._noise(observation["history"], output.motion)
+        action = output.mean + self.actor.log_std.exp() * self._noise(observation["history"])
         if not bool(torch.isfinite(action).all()):
             for key, values in observation.items():
                 require_finite(f"observation {key!r} at rollout step {self.storage.position}", values)
@@ -140,15 +138,15 @@ class PPO:
         self.storage.write({**observation, **estimates, **acted})
         return action
 
-    def _noise(self, history: Tensor, motion: Tensor) -> Tensor:
-        """Exploration noise of unit variance (N, A), a share of which answers the gait clock and the capture point.
+    def _noise(self, history: Tensor) -> Tensor:
+        """Exploration noise of unit variance (N, A), a share of which is a pattern over the gait clock.
 
-        White noise at 50 Hz hardly changes how a robot walks or balances, and what it does change drowns in what falls
-        do to the returns. A robot that keeps a pattern for a while has a slightly different gait and answers toppling
-        in a slightly different way, and its returns tell whether that is a better one. As in gSDE (Raffin et al., arXiv
-        2005.05719) the probability of an action stays that of its marginal distribution.
+        White noise at 50 Hz hardly changes how a robot walks, and what it does change drowns in what falls do to the
+        returns. A robot that keeps a pattern for a while has a slightly different gait, and its returns tell whether
+        that is a better one. As in gSDE (Raffin et al., arXiv 2005.05719) the probability of an action stays that of
+        its marginal distribution.
         """
-        share, shape = self.config.pattern_share, (len(history), self.sizes.action)
+        share, shape = self.gait_noise_share, (len(history), self.sizes.action)
 
         def normal(*size: int) -> Tensor:
             return torch.randn(*size, generator=self.generator, device=self.device)
@@ -156,20 +154,29 @@ class PPO:
         if self.gait_clock is None or share == 0.0:
             return normal(*shape)
         chance = torch.rand(shape[0], generator=self.generator, device=self.device)
-        renewed = chance * self.config.pattern_steps < 1.0
-        fresh = torch.where(self._pattern.any(), renewed, True)[:, None, None]
-        self._pattern = torch.where(fresh, normal(*shape, self._pattern.shape[2]), self._pattern)
+        renewed = chance * self.config.gait_noise_steps < 1.0
+        fresh = torch.where(self._gait_noise.any(), renewed, True)[:, None, None]
+        self._gait_noise = torch.where(fresh, normal(*shape, 3), self._gait_noise)
         clock = history[:, -self.sizes.frame :][:, self.gait_clock]
-        topples = motion[:, CAPTURE_POINT]
-        topples = topples / topples.norm(dim=1, keepdim=True).clamp_min(TOPPLING)
-        features = torch.cat([torch.ones_like(clock[:, :1]), clock, topples], dim=1)
-        pattern = (self._pattern * functional.normalize(features, dim=1)[:, None]).sum(dim=2)
+        # Sine and cosine share the variance with the constant; at a stand, where the clock is zero, it has all of it.
+        walking = clock.square().sum(dim=1, keepdim=True)
+        parts = torch.cat([torch.sqrt(1.0 - 0.5 * walking), clock * 0.5**0.5], dim=1)
+        pattern = (self._gait_noise * parts[:, None]).sum(dim=2)
         return (1.0 - share) ** 0.5 * normal(*shape) + share**0.5 * pattern
 
-    def enter(self, std: tuple[float, float], acting: int, rollout_doublings: int) -> None:
+    def enter(
+        self,
+        std: tuple[float, float],
+        acting: int,
+        rollout_doublings: int = 0,
+        gait_noise_share: float = 0.0,
+        normalizes_by_task: bool = False,
+    ) -> None:
         """Go on with exploration noise between the bounds ``std``, in the first ``acting`` actions only.
 
-        Rollouts are 2 to the power of ``rollout_doublings`` times as long as at first.
+        Rollouts are 2 to the power of ``rollout_doublings`` times as long as at first. ``gait_noise_share``: share of
+        the noise's variance that repeats with the gait. ``normalizes_by_task``: whether advantages are normalized
+        within each task.
 
         Raises:
             ValueError: in the middle of a rollout.
@@ -181,6 +188,7 @@ class PPO:
             self.storage = self._room_for(steps, self.storage.num_envs)
         self.learner.acting = slice(0, acting)
         self.learner.std_bounds = std
+        self.gait_noise_share, self.normalizes_by_task = gait_noise_share, normalizes_by_task
         self.learner.limit_noise()
 
     @torch.no_grad()
@@ -274,7 +282,8 @@ class PPO:
         storage.data["returns"].copy_(advantages + values)
         explained = 1.0 - float(advantages.var() / storage.data["returns"].var().clamp(min=1e-8))
         limit = self.config.advantage_limit
-        normalized = normalized_by_task(advantages, storage.task, self.tasks)
+        task = storage.task if self.normalizes_by_task else torch.zeros_like(storage.task)
+        normalized = normalized_by_task(advantages, task, self.tasks)
         storage.data["advantage"].copy_(normalized.clamp(-limit, limit))
         return explained
 
@@ -342,7 +351,7 @@ class PPO:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that learning depends on, as tensors, numbers, strings, lists and dicts."""
-        own = {"generator": self.generator.get_state(), "updates": self.updates, "pattern": self._pattern}
+        own = {"generator": self.generator.get_state(), "updates": self.updates, "gait_noise": self._gait_noise}
         return {**self.learner.state_dict(), **own}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -355,8 +364,8 @@ class PPO:
         self.updates = int(state["updates"])
         if rank() == 0:
             self.generator.set_state(state["generator"].cpu())
-            if state["pattern"].shape == self._pattern.shape:  # else of another number of robots
-                self._pattern = state["pattern"].to(self.device, copy=True)
+            if state["gait_noise"].shape == self._gait_noise.shape:  # else of another number of robots
+                self._gait_noise = state["gait_noise"].to(self.device, copy=True)
         else:
             self.generator.manual_seed(self.seed + 1000 * rank() + 1_000_003 * self.updates)
         self.storage.clear()

@@ -174,8 +174,7 @@ def _armature_gains() -> Gains:
 STIFF_GAINS = Gains(
     stiffness=_per_joint((150, 150, 150, 300, 40, 40), (200, 200, 200), (80, 80, 80, 80, 40, 40, 40)),
     damping=_per_joint((5, 5, 5, 8, 2, 2), (5, 5, 5), (3, 3, 3, 3, 1.5, 1.5, 1.5)),
-    # 24 to 38 N m in legs and waist: exploration noise shakes no joint much harder than the others
-    action_scale=_per_joint((1 / 6, 1 / 6, 1 / 6, 0.125, 0.6, 0.6), (0.12,) * 3, (0.08,) * 7),
+    action_scale=_per_joint((1 / 6, 1 / 6, 1 / 6, 0.125, 0.25, 0.25), (0.12,) * 3, (0.08,) * 7),
 )
 SOFT_GAINS = _armature_gains()
 GAINS: dict[str, Gains] = {"stiff": STIFF_GAINS, "soft": SOFT_GAINS}

@@ -27,9 +27,9 @@ def test_rates_count_work_per_second() -> None:
 def test_the_shares_of_an_environment_step_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("evaluation.protocols.speed.WINDOWS", 1)
     standing = EnvironmentConfig(num_robots=8, num_threads=1, start_moving=0.0, mixture=(("stand", 1.0),))
-    environment = PilotEnvironment(standing)  # nobody falls: resets would count as neither physics nor Python
+    environment = PilotEnvironment(standing)  # nobody falls so soon: resets count as neither physics nor Python
     environment.reset()
-    figures = measure_environment(environment, seconds=0.2)
+    figures = measure_environment(environment, seconds=0.02)
     values = {name: figure.value for name, figure in figures.items()}
     rate, physics, share = (
         values[name]

@@ -22,7 +22,6 @@ from small_learner import (
 from lowlevel.learning.learner import adapted_rate, clipped_surrogate
 from lowlevel.learning.ppo import PPO, NonFiniteError, PPOConfig
 from lowlevel.learning.symmetry import TensorMirrors
-from lowlevel.networks.actor import CAPTURE_POINT, MOTION_SIZE
 
 FAST = {"critic_learning_rate": 2e-3, "actor_learning_rate": 1e-3, "initial_std": 0.3}
 
@@ -202,7 +201,7 @@ def test_no_sample_outweighs_the_others() -> None:
 
 def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
     ppo = make_ppo(2048, initial_std=0.3, steps_per_update=1, minibatches=1)
-    ppo.enter((0.3, 0.4), acting=4, rollout_doublings=0)
+    ppo.enter((0.3, 0.4), acting=4)
     observed = observation(torch.Generator().manual_seed(0), 2048)
     noise = ppo.act(observed) - ppo.deterministic(observed)
     torch.testing.assert_close(noise.std(dim=0), torch.full((4,), 0.3), rtol=0.06, atol=0)
@@ -214,34 +213,47 @@ def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
     assert float(deviations.min()) > 0.2999 and float(deviations.max()) < 0.4001
 
 
-def test_the_pattern_in_the_noise_has_unit_variance_and_answers_clock_and_capture_point() -> None:
+def test_gait_noise_has_unit_variance_and_repeats_with_the_clock() -> None:
     robots = 4096
-    ppo = make_ppo(robots, pattern_share=1.0, pattern_steps=1e9)
+    ppo = make_ppo(robots, gait_noise_steps=1e9)
+    ppo.gait_noise_share = 1.0
     ppo.gait_clock = slice(0, 2)
 
-    def noise(phase: float | None, topples: float = 0.0) -> torch.Tensor:
-        frame, motion = torch.zeros(robots, SIZES.frame), torch.zeros(robots, MOTION_SIZE)
+    def noise(phase: float | None) -> torch.Tensor:
+        frame = torch.zeros(robots, SIZES.frame)
         if phase is not None:
             frame[:, 0], frame[:, 1] = math.sin(phase), math.cos(phase)
-        motion[:, CAPTURE_POINT] = torch.tensor([topples, 0.0])
-        return ppo._noise(frame, motion)
+        return ppo._noise(frame)
 
     first, half, again, still = noise(0.4), noise(0.4 + math.pi), noise(0.4), noise(None)
     assert torch.equal(first, again) and not torch.allclose(first, half)
     torch.testing.assert_close(noise(None), still)
-    forwards, backwards = noise(None, 0.1), noise(None, -0.1)
-    assert torch.equal(forwards, noise(None, 0.2)) and not torch.allclose(forwards, backwards)
-    torch.testing.assert_close(forwards + backwards, still * 2.0**0.5)
-    for pattern in (first, half, still, forwards):
+    for pattern in (first, half, still):
         torch.testing.assert_close(pattern.std(dim=0), torch.ones(SIZES.action), rtol=0.05, atol=0.0)
-    ppo.config = dataclasses.replace(ppo.config, pattern_share=0.5)
+    ppo.gait_noise_share = 0.5
     assert torch.corrcoef(torch.stack([noise(0.4)[:, 0], first[:, 0]]))[0, 1] == pytest.approx(0.5**0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("by_task", [False, True])
+def test_advantages_are_normalized_as_the_stage_has_it(by_task: bool) -> None:
+    ppo = make_ppo(robots=64, steps_per_update=1, minibatches=1)
+    ppo.tasks = 2
+    ppo.enter((0.05, 1.0), acting=4, normalizes_by_task=by_task)
+    ppo.act(observation(torch.Generator().manual_seed(0), 64))
+    task = torch.arange(64) % 2
+    reward = torch.where(task == 0, 100.0, 1.0) * torch.randn(64, generator=torch.Generator().manual_seed(1))
+    ended = torch.ones(64, dtype=torch.bool)
+    ppo.record(reward, ended, ~ended, torch.zeros(64, SIZES.privileged), task)
+    ppo._store_returns(torch.zeros(64, SIZES.privileged))
+    advantage = ppo.storage.data["advantage"][0]
+    ratio = advantage[task == 0].std() / advantage[task == 1].std()
+    assert ratio < 1.5 if by_task else ratio > 30.0
 
 
 @pytest.mark.parametrize(("bounds", "expected"), [((0.05, 1.0), 0.2), ((0.05, 0.1), 0.1), ((0.4, 1.0), 0.4)])
 def test_noise_moves_into_the_bounds_of_a_stage(bounds: tuple[float, float], expected: float) -> None:
     ppo = make_ppo(initial_std=0.2)
-    ppo.enter(bounds, acting=4, rollout_doublings=0)
+    ppo.enter(bounds, acting=4)
     torch.testing.assert_close(ppo.actor.log_std.exp(), torch.full((4,), expected))
 
 
@@ -256,7 +268,7 @@ def test_rollouts_are_as_long_as_a_stage_has_them(doublings: int, steps: int) ->
 
 def test_actions_that_do_not_act_are_not_learned() -> None:
     ppo = make_ppo(epochs=2, mirror_loss_weight=0.0, actor_learning_rate=1e-2)
-    ppo.enter((0.05, 1.0), acting=2, rollout_doublings=0)
+    ppo.enter((0.05, 1.0), acting=2)
     before = ppo.actor.head.output_weight.detach().clone(), ppo.actor.log_std.detach().clone()
     figures = run_update(ppo, 0)
     after = ppo.actor.head.output_weight, ppo.actor.log_std

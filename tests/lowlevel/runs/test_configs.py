@@ -21,13 +21,13 @@ def test_a_configuration_comes_back_from_json_as_it_was(name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda prior: prior | {"color": 1}, "GaitPriorConfig has no field 'color'"),
-        (lambda prior: {k: v for k, v in prior.items() if k != "lift"}, "GaitPriorConfig lacks its field 'lift'"),
+        (lambda noise: noise | {"color": 1}, "NoiseConfig has no field 'color'"),
+        (lambda noise: {k: v for k, v in noise.items() if k != "elevation"}, "NoiseConfig lacks its field 'elevation'"),
     ],
 )
 def test_unknown_and_absent_fields_are_refused(change, message: str) -> None:
     plain = asdict(TrainingConfig())
-    plain["environment"]["prior"] = change(plain["environment"]["prior"])
+    plain["environment"]["noise"] = change(plain["environment"]["noise"])
     with pytest.raises(KeyError, match=message):
         from_plain(TrainingConfig, plain)
 
