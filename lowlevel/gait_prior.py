@@ -22,6 +22,7 @@ from lowlevel.control.stepping import FARTHEST
 from robots.g1.constants import NUM_JOINTS, joint_index
 
 _PRESS = {"ankle_pitch": 1.0, "knee": 0.25, "hip_pitch": 0.2}
+"""What each joint of a leg adds to a press on the toes, as a share of what the ankle does."""
 _ROWS: tuple[dict[str, float], ...] = (
     # Lift of the left foot, of the right foot: the knee flexes, hip and ankle take half of it back.
     {"left_hip_pitch": -0.5, "left_knee": 1.0, "left_ankle_pitch": -0.5},
@@ -55,7 +56,8 @@ class GaitPriorConfig:
     stride_lead: float = 0.7
     """Phase by which the stride leads the gait clock, because loaded hips follow late [rad]."""
     balance: float = 8.0
-    """Ankle pitch at a stand per distance by which the capture point lies ahead of the feet [rad/m]."""
+    """Ankle pitch at a stand per distance by which the capture point lies ahead of the feet [rad/m]; knees and hips do
+    their shares of it."""
     braking: float = 0.3
     """Ankle pitch of the stance leg per m/s by which the robot walks too fast [rad]."""
     turning_back: float = 0.0
@@ -88,6 +90,7 @@ class GaitPrior:
         # Beyond FARTHEST the robot steps.
         balance = config.balance * capture_point[:, :1].clamp(-FARTHEST, FARTHEST) * ~state.walking[:, None]
         stance = torch.stack([sine < 0.0, sine > 0.0], dim=1)
+        # What is faster than 1 m/s or 1 rad/s is a fall.
         forwards, _, turning = velocity_error.clamp(-1.0, 1.0).split(1, dim=1)
         answers = [config.braking * forwards * stance, config.turning_back * turning * stance]
         gait = torch.cat([lift, config.shift * sine[:, None], stride], dim=1) * state.walking[:, None]

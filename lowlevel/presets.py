@@ -65,6 +65,9 @@ FIRM = replace(GENTLE, push_velocity=0.4)
 HARD = RandomizationConfig()
 """For a controller that is to be shipped: loads in the hands, late and weak motors, slippery ground, hard pushes."""
 
+WORK = (("steer", 0.2), ("stand", 0.05), ("stand_and_work", 0.4), ("walk_and_work", 0.35))
+"""For postures and moving arms."""
+
 EVERYTHING = (
     ("steer", 0.15),
     ("slow", 0.15),
@@ -173,7 +176,7 @@ STAGES = (
         least_steps=15_000_000,  # at first, in what is open by then, robots seldom fall
         most_steps=60_000_000,
         std=(0.07, 0.15),
-        mixture=(("steer", 0.2), ("stand", 0.05), ("stand_and_work", 0.4), ("walk_and_work", 0.35)),
+        mixture=WORK,
         rewards=STEPPING,
         randomization=GENTLE,
     ),
@@ -182,7 +185,7 @@ STAGES = (
         most_steps=1_000_000,
         std=(0.07, 0.15),
         prior=ANSWERS,
-        mixture=(("steer", 0.2), ("stand", 0.05), ("stand_and_work", 0.4), ("walk_and_work", 0.35)),
+        mixture=WORK,
         rewards=STEPPING,
         randomization=GENTLE,
     ),
