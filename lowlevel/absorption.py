@@ -1,8 +1,8 @@
-"""Cloning a policy and the gait prior under it into the policy alone.
+"""Cloning a better way of acting into the policy alone.
 
-The prior is a function of what the policy sees or estimates (clock, slewed velocity and capture point), so the sum of
-both is a policy, too. The student acts in the world without prior, and imitates what teacher and prior would do there
-(DAgger, Ross et al., AISTATS 2011). A fade of the prior costs speed faster than PPO can take it over; this costs
+What a gait prior adds, or what a policy does that is told another velocity, is a function of what the policy sees or
+estimates; so it is a policy, too. The student acts in the world by itself, and imitates what its teacher would do there
+(DAgger, Ross et al., AISTATS 2011). A fade of a gait prior costs speed faster than PPO can take it over; this costs
 minutes and no skill.
 """
 
@@ -12,6 +12,7 @@ import copy
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -44,6 +45,39 @@ class AbsorptionConfig:
     """Learning rate; a third of it in the last fifth of the rounds."""
 
 
+class Teacher(Protocol):
+    """What the student imitates."""
+
+    def label(self, observation: dict[str, Tensor]) -> Tensor:
+        """The action to imitate (N, A); asked for once a control step."""
+
+    def forget(self, robots: Tensor) -> None:
+        """An episode of the ``robots`` (N,) bool has ended."""
+
+
+class PriorTeacher:
+    """A copy of the policy, and the gait prior under it in a world that has none."""
+
+    def __init__(self, ppo: PPO, environment: PilotEnvironment, prior: GaitPrior) -> None:
+        self._policy = copy.deepcopy(ppo.actor).eval().requires_grad_(False)
+        self._environment, self._prior = environment, prior
+        # What of each remembered action is the prior's: the policy has never seen it there.
+        self._offsets = torch.zeros(environment.num_robots, HISTORY_LENGTH + 1, NUM_JOINTS, device=ppo.device)
+
+    @torch.no_grad()
+    def label(self, observation: dict[str, Tensor]) -> Tensor:
+        seen = observation["history"].view(*self._offsets.shape[:2], FRAME_SIZE).clone()
+        seen[:, :, columns(FRAME, "last_action")] -= self._offsets
+        state = self._environment.buffers
+        offset = self._prior(state.reference, state.capture_point, state.mean_velocity_error)
+        offset = (offset / self._environment.action_scale).to(seen.device)
+        self._offsets = torch.cat([self._offsets[:, 1:], offset[:, None]], dim=1)
+        return self._policy(seen.flatten(1), observation["elevation_map"], observation["flag"]).mean + offset
+
+    def forget(self, robots: Tensor) -> None:
+        self._offsets[robots] = 0.0
+
+
 @torch.no_grad()
 def _mirrored(ppo: PPO, observation: dict[str, Tensor], label: Tensor) -> tuple[Tensor, ...]:
     """The mirror image of a sample. An asymmetric clone would spend PPO's first million steps on its mirror loss."""
@@ -53,20 +87,17 @@ def _mirrored(ppo: PPO, observation: dict[str, Tensor], label: Tensor) -> tuple[
     return frame, elevation.clone(), observation["flag"].clone(), motion, latent, ppo.mirrors("action", label)
 
 
-def absorb_prior(
-    ppo: PPO, environment: PilotEnvironment, prior: GaitPrior, config: AbsorptionConfig, report: Callable[[str], None]
+def clone(
+    ppo: PPO, environment: PilotEnvironment, teacher: Teacher, config: AbsorptionConfig, report: Callable[[str], None]
 ) -> dict[str, Tensor]:
-    """Teach the actor of ``ppo`` to act in ``environment``, which has no prior, as it did under ``prior``.
+    """Teach the actor of ``ppo`` to act in ``environment`` as ``teacher`` would.
 
     ``report`` is told how it goes, a line a round. Returns the observation to go on from.
     """
-    student, robots, frames, device = ppo.actor, environment.num_robots, HISTORY_LENGTH + 1, ppo.device
-    teacher = copy.deepcopy(student).eval().requires_grad_(False)
-    last_action, acting, std = columns(FRAME, "last_action"), ppo.learner.acting, student.log_std.exp().detach()
+    student, device = ppo.actor, ppo.device
+    acting, std = ppo.learner.acting, student.log_std.exp().detach()
     optimizer = torch.optim.Adam(student.policy_parameters(), lr=config.learning_rate)
     kept: deque[tuple[Tensor, ...]] = deque(maxlen=config.kept_rounds)
-    # What of each remembered action is the prior's: the teacher has never seen it there.
-    offsets = torch.zeros(robots, frames, NUM_JOINTS, device=device)
     observation = environment.reset(spread_episodes=True)
     for round_number in range(config.rounds):
         handing_over = max(0.0, 1.0 - round_number / config.mixed_rounds)
@@ -74,27 +105,20 @@ def absorb_prior(
             optimizer.param_groups[0]["lr"] = config.learning_rate / 3.0
         samples, falls = [], 0
         for _ in range(config.steps):
-            seen_now = {name: values.to(device) for name, values in observation.items()}
-            history = seen_now["history"].view(robots, frames, FRAME_SIZE)
-            seen = history.clone()
-            seen[:, :, last_action] -= offsets
-            state = environment.buffers
-            offset = prior(state.reference, state.capture_point, state.mean_velocity_error)
-            offset = (offset / environment.action_scale).to(device)
+            seen = {name: values.to(device) for name, values in observation.items()}
+            context = (seen["elevation_map"], seen["flag"])
+            label = teacher.label(seen)
             with torch.no_grad():
-                context = (seen_now["elevation_map"], seen_now["flag"])
-                label = teacher(seen.flatten(1), *context).mean + offset
-                own = student(seen_now["history"], *context)
-            teachers_turn = torch.rand(robots, 1, generator=ppo.generator, device=device) < handing_over
+                own = student(seen["history"], *context)
+            teachers_turn = torch.rand(len(label), 1, generator=ppo.generator, device=device) < handing_over
             noise = 0.5 * std * torch.randn(label.shape, generator=ppo.generator, device=device)
             action = torch.where(teachers_turn, label, own.mean) + noise
-            samples.append((history[:, -1].clone(), *(c.clone() for c in context), own.motion, own.latent, label))
-            samples.append(_mirrored(ppo, seen_now, label))
+            frame = seen["history"][:, -FRAME_SIZE:].clone()
+            samples.append((frame, *(c.clone() for c in context), own.motion, own.latent, label))
+            samples.append(_mirrored(ppo, seen, label))
             result = environment.step(action.cpu())
-            ended = (result.terminated | result.truncated).to(device)
             falls += int(result.terminated.sum())
-            offsets = torch.cat([offsets[:, 1:], offset[:, None]], dim=1)
-            offsets[ended] = 0.0
+            teacher.forget((result.terminated | result.truncated).to(device))
             observation = result.observation
         kept.append(tuple(torch.cat(column) for column in zip(*samples, strict=True)))
         *inputs, labels = (torch.cat(column) for column in zip(*kept, strict=True))
@@ -109,7 +133,7 @@ def absorb_prior(
             torch.nn.utils.clip_grad_norm_(student.policy_parameters(), 5.0)
             optimizer.step()
             losses.append(float(loss.detach()))
-        between_falls = config.steps * robots / max(falls, 1)
+        between_falls = config.steps * environment.num_robots / max(falls, 1)
         divergence = sum(losses) / len(losses)
-        report(f"absorbing the gait prior: {divergence:.3f} nat, falls every {between_falls:.0f} steps")
+        report(f"cloning: {divergence:.3f} nat, falls every {between_falls:.0f} steps")
     return observation

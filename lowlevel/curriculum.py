@@ -17,6 +17,9 @@ from lowlevel.runs.distributed import sum_over_ranks
 QUALITY_TERMS = ("linear_velocity", "angular_velocity", "base_height", "torso_orientation")
 """Reward terms in [0, 1] whose mean is the quality of tracking."""
 
+FIRST_FALL_RATE = 0.05
+"""What is assumed of a kind before it was seen [falls per control step]."""
+
 
 @dataclass(frozen=True)
 class CurriculumConfig:
@@ -30,8 +33,10 @@ class CurriculumConfig:
     """Quality of tracking above which a kind may grow, under the noise of exploration."""
     steps_between_falls: float = 300.0
     """Control steps of a kind per fall above which it may grow; below half as many it shrinks. Where every robot falls
-    no action is better than another, and nothing is learned. For the hardness all kinds together must fall half as
-    often; it goes down again where they fall more often than this."""
+    no action is better than another, and nothing is learned."""
+    hard_steps_between_falls: float = 2500.0
+    """Control steps per fall, of all kinds together, above which the conditions get harder; below half as many they
+    ease. At a fall every 600 steps the robots learn not to fall and track no better."""
     smoothing: float = 0.1
     """Weight of the last update in the measured averages."""
     most_often: float = 2.0
@@ -46,7 +51,7 @@ class Curriculum:
         count = len(KINDS)
         self.opening = torch.full((count,), config.start)
         self.quality = torch.zeros(count)
-        self.fall_rate = torch.full((count,), 0.05)
+        self.fall_rate = torch.full((count,), FIRST_FALL_RATE)
         """Falls per control step."""
         self.hardness = torch.zeros(())
         """How hard the conditions are, in [0, 1], in stages that make them harder."""
@@ -57,6 +62,12 @@ class Curriculum:
         quality = torch.stack([terms[name] for name in QUALITY_TERMS]).mean(dim=0)
         for row, values in zip(self._sums, (torch.ones_like(quality), quality, fallen.float()), strict=True):
             row.index_add_(0, kind.cpu(), values.cpu())
+
+    def introduce(self, kinds: Tensor) -> None:
+        """Open ``kinds`` (kinds,) bool anew, as at the start: robots that were not told them forget them."""
+        self.opening[kinds] = self.config.start
+        self.quality[kinds] = 0.0
+        self.fall_rate[kinds] = FIRST_FALL_RATE
 
     def update(self, hardens: bool = False) -> None:
         """Take in what was observed since the last update, over all ranks, and open what is tracked.
@@ -74,8 +85,8 @@ class Curriculum:
         change = config.growth * (grows * (self.quality > config.quality) - shrinks) * seen
         self.opening = (self.opening + change).clamp(config.start, 1.0)
         if hardens:
-            of_all = (falls_per_budget * steps).sum() / steps.sum()
-            change = config.growth * ((of_all < 0.5).float() - (of_all > 1.0).float())
+            falls_per_budget = (self.fall_rate * steps).sum() / steps.sum() * config.hard_steps_between_falls
+            change = config.growth * ((falls_per_budget < 1.0).float() - (falls_per_budget > 2.0).float())
             self.hardness = (self.hardness + change).clamp(0.0, 1.0)
         self._sums = torch.zeros_like(self._sums)
 

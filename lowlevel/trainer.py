@@ -12,7 +12,8 @@ import torch
 import tyro
 from torch import Tensor
 
-from lowlevel.absorption import AbsorptionConfig, absorb_prior
+from lowlevel.absorption import AbsorptionConfig, PriorTeacher, clone
+from lowlevel.calibration import CalibrationConfig, calibrate
 from lowlevel.commands import KINDS, shares
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import (
@@ -55,6 +56,7 @@ class TrainingConfig:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     absorption: AbsorptionConfig = field(default_factory=AbsorptionConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     stages: Annotated[tuple[Stage, ...], tyro.conf.Suppress] = (Stage(),)
     """Run one after the other."""
 
@@ -159,10 +161,16 @@ class Trainer:
         if not reached and taken < stage.most_steps:
             return
         self.save()
-        prior = self.environment.prior
+        prior, told_before = self.environment.prior, self._shares > 0.0
         self._begin_stage(self.stage_number + 1)
+        self.curriculum.introduce((self._shares > 0.0) & ~told_before)
         if prior is not None and self.environment.prior is None:
-            self.observation = absorb_prior(self.ppo, self.environment, prior, self.config.absorption, report)
+            report("absorbing the gait prior")
+            teacher = PriorTeacher(self.ppo, self.environment, prior)
+            self.observation = clone(self.ppo, self.environment, teacher, self.config.absorption, report)
+        elif self.stage.calibrates:
+            calibration, cloning = self.config.calibration, self.config.absorption
+            self.observation = calibrate(self.ppo, self.environment, calibration, cloning, report)
         else:
             self.observation = self.environment.reset(spread_episodes=True)
 

@@ -66,6 +66,19 @@ def test_conditions_become_harder_while_few_robots_fall_and_only_where_they_may(
     assert [update(0.01) for _ in range(60)][-1] < 0.9
 
 
+def test_a_kind_that_was_not_told_for_a_while_opens_anew() -> None:
+    curriculum = Curriculum(CurriculumConfig())
+    for _ in range(300):
+        see(curriculum, {"walk": 0.9, "squat": 0.9})
+    assert float(curriculum.opening[NAMES.index("squat")]) == 1.0
+    curriculum.introduce(torch.tensor([kind == "squat" for kind in KINDS]))
+    start = pytest.approx(CurriculumConfig().start)
+    assert float(curriculum.opening[NAMES.index("squat")]) == start
+    assert float(curriculum.opening[NAMES.index("walk")]) == 1.0
+    see(curriculum, {"squat": 0.9})
+    assert float(curriculum.opening[NAMES.index("squat")]) == start
+
+
 def test_state_round_trip() -> None:
     curriculum, other = Curriculum(CurriculumConfig()), Curriculum(CurriculumConfig())
     for _ in range(10):

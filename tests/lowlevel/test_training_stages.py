@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lowlevel.absorption import AbsorptionConfig, absorb_prior
+from lowlevel.absorption import AbsorptionConfig, PriorTeacher, clone
 from lowlevel.commands import KINDS
 from lowlevel.curriculum import CurriculumConfig
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
@@ -49,6 +49,16 @@ def test_the_next_stage_begins_when_its_figure_is_reached(tmp_path: Path) -> Non
     assert float(trainer.ppo.actor.log_std.exp().max()) <= 0.1 + 1e-6
 
 
+def test_only_kinds_that_a_stage_brings_in_open_anew(tmp_path: Path) -> None:
+    first = replace(FIRST, prior=None, mixture=(("walk", 0.5), ("squat", 0.5)))
+    trainer = Trainer(tiny(first, replace(SECOND, mixture=(("walk", 0.5), ("slow", 0.5)))), tmp_path)
+    trainer.curriculum.opening[:] = 0.9
+    trainer.observation = trainer.environment.reset()
+    trainer._follow_stages({"reward/alive": 100.0}, print)
+    opening = dict(zip(KINDS, trainer.environment.opening.tolist(), strict=True))
+    assert opening["walk"] == opening["squat"] == pytest.approx(0.9) and opening["slow"] == pytest.approx(0.3)
+
+
 def test_a_stage_that_never_gets_there_ends_by_its_steps(tmp_path: Path) -> None:
     hopeless = replace(FIRST, above=2.0, most_steps=128)
     trainer = Trainer(replace(tiny(hopeless, SECOND), total_steps=64 * 2), tmp_path)
@@ -82,8 +92,12 @@ def test_absorption_teaches_the_policy_what_the_prior_did(tmp_path: Path) -> Non
     prior = GaitPrior(GaitPriorConfig())
     progress: list[float] = []
     settings = AbsorptionConfig(rounds=12, mixed_rounds=6, minibatch=256, learning_rate=3e-3)
-    observation = absorb_prior(
-        trainer.ppo, alone, prior, settings, lambda text: progress.append(float(text.split(": ")[1].split(" nat")[0]))
+    observation = clone(
+        trainer.ppo,
+        alone,
+        PriorTeacher(trainer.ppo, alone, prior),
+        settings,
+        lambda text: progress.append(float(text.split(": ")[1].split(" nat")[0])),
     )
     assert progress[-1] < 0.3 * progress[0]
     state = alone.buffers
