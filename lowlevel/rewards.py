@@ -235,15 +235,16 @@ def angular_velocity_fine(t: Transition, variance: float = 0.04) -> Tensor:
     return gaussian(velocity_error(t.measured, t.command)[:, 2].square(), variance)
 
 
-def mean_linear_velocity(t: Transition, width: float = 0.1) -> Tensor:
+def mean_linear_velocity(t: Transition, width: float = 0.4) -> Tensor:
     """Tracking of vx and vy on average; ``width`` [m/s].
 
-    The pelvis sways by as much with every step: at once, a drift of 0.1 m/s hardly changes the kernels above.
+    The pelvis sways by as much with every step: at once, a drift of 0.1 m/s hardly changes the kernels above, and one
+    of 0.3 m/s has left them.
     """
     return laplace(t.mean_velocity_error[:, :2].norm(dim=-1), width)
 
 
-def mean_angular_velocity(t: Transition, width: float = 0.15) -> Tensor:
+def mean_angular_velocity(t: Transition, width: float = 0.4) -> Tensor:
     """Tracking of the yaw rate on average; ``width`` [rad/s]."""
     return laplace(t.mean_velocity_error[:, 2], width)
 
