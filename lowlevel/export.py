@@ -47,7 +47,7 @@ def export_controller(trainer: Trainer, folder: Path, revision: str | None = Non
         PilotError: if the run is in a stage with a gait prior, which no controller has.
     """
     if trainer.stage.prior is not None:
-        raise PilotError(f"the policy still leans on the gait prior in the stage {trainer.stage.name!r}: train on")
+        raise PilotError(f"no controller has the gait prior of the stage {trainer.stage.name!r}: train on")
     environment = trainer.environment
     config, pose = controller_config(environment), environment.reference.pose
     policy = PolicyConfig(environment.config.reference, trainer.config.network, pose.axes)

@@ -36,7 +36,7 @@ class Stage:
     prior: GaitPriorConfig | None = None
     """What a gait prior adds to the policy's targets. When a stage without one follows, the policy absorbs it first."""
     calibrates: bool = False
-    """Whether the stage begins with a calibration of the told velocity (:mod:`lowlevel.calibration`)."""
+    """Whether the stage begins with a calibration of the told velocity (:mod:`lowlevel.imitation.calibration`)."""
     gait_noise: float = 0.8
     """Share of the exploration noise's variance that is a pattern over the gait clock, and constant at a stand: for a
     robot that improves its gait. One that learns to balance does it in white noise."""

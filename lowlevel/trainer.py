@@ -12,8 +12,6 @@ import torch
 import tyro
 from torch import Tensor
 
-from lowlevel.absorption import AbsorptionConfig, PriorTeacher, clone
-from lowlevel.calibration import CalibrationConfig, calibrate
 from lowlevel.commands import KINDS, shares
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import (
@@ -25,6 +23,8 @@ from lowlevel.control.observation import (
 )
 from lowlevel.curriculum import Curriculum, CurriculumConfig
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
+from lowlevel.imitation.calibration import CalibrationConfig, calibrate
+from lowlevel.imitation.cloning import CloningConfig, PriorTeacher, clone
 from lowlevel.learning.ppo import PPO, PPOConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes
 from lowlevel.runs.distributed import any_rank, average_over_ranks, rank, world_size
@@ -44,7 +44,7 @@ class TrainingConfig:
     """A training run: task, stages, networks, learner and curriculum."""
 
     total_steps: int = 250_000_000
-    """Environment steps (robots times control steps), over all ranks."""
+    """Environment steps (robots times control steps) of PPO, over all ranks; calibrating and cloning take some more."""
     seed: int = 0
     """Seed of weights, noise, commands and randomization."""
     device: str = "cpu"
@@ -55,7 +55,7 @@ class TrainingConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
-    absorption: AbsorptionConfig = field(default_factory=AbsorptionConfig)
+    cloning: CloningConfig = field(default_factory=CloningConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     stages: Annotated[tuple[Stage, ...], tyro.conf.Suppress] = (Stage(),)
     """Run one after the other."""
@@ -161,18 +161,20 @@ class Trainer:
         if not reached and taken < stage.most_steps:
             return
         self.save()
-        prior, told_before = self.environment.prior, self._shares > 0.0
+        prior, upcoming = self.environment.prior, self.config.stages[self.stage_number + 1]
+        self.curriculum.introduce((shares(upcoming.mixture) > 0.0) & (self._shares == 0.0))
         self._begin_stage(self.stage_number + 1)
-        self.curriculum.introduce((self._shares > 0.0) & ~told_before)
-        if prior is not None and self.environment.prior is None:
+        if prior is not None and upcoming.prior is None:
             report("absorbing the gait prior")
             teacher = PriorTeacher(self.ppo, self.environment, prior)
-            self.observation = clone(self.ppo, self.environment, teacher, self.config.absorption, report)
-        elif self.stage.calibrates:
-            calibration, cloning = self.config.calibration, self.config.absorption
-            self.observation = calibrate(self.ppo, self.environment, calibration, cloning, report)
-        else:
+            self.observation = clone(self.ppo, self.environment, teacher, self.config.cloning, report)
+        if upcoming.calibrates:
+            self.observation = calibrate(
+                self.ppo, self.environment, self.config.calibration, self.config.cloning, report
+            )
+        if not self.observation:
             self.observation = self.environment.reset(spread_episodes=True)
+        self.save()
 
     # -- the loop ---------------------------------------------------------------------------------------------
 
@@ -195,7 +197,9 @@ class Trainer:
                 figures["speed/steps_per_second"] = self._steps_per_iteration / seconds
                 if rank() == 0:
                     self.run.log(figures, self.trained_seconds, "steps", self.steps)
-                self._follow_stages(figures, lambda text: progress.update(task, description=text))
+                started = time.monotonic()
+                self._follow_stages(figures, progress.console.print)
+                self.trained_seconds += time.monotonic() - started
                 progress.update(task, completed=self.steps, description=self._headline(figures))
                 if time.monotonic() - last_save > self.config.save_interval:
                     self.save()

@@ -1,1 +1,1 @@
-"""How the networks learn: PPO, the estimator and absorption of the gait prior."""
+"""How the networks learn: PPO and the estimator."""

@@ -233,9 +233,9 @@ class PPO:
         storage, config = self.storage, self.config
         if not storage.full:
             raise ValueError(f"only {storage.position} of {storage.steps} rollout steps are recorded")
-        calibrating = float(self.actor.normalizer.count) == 0
-        if calibrating:
-            self._calibrate()
+        first_rollout = float(self.actor.normalizer.count) == 0
+        if first_rollout:
+            self._fit_normalizers()
         explained = self._store_returns(observation_after["privileged"].to(self.device))
         old_std = self.actor.log_std.detach().exp().clone()
         history: dict[str, list[float]] = {}
@@ -251,7 +251,7 @@ class PPO:
         means |= {f"estimation/{name}_rmse": math.sqrt(means.pop(f"estimation/{name}_mse")) for name in ESTIMATED}
         means["estimation/policy_drift"] = self._estimator_drift()
         means |= {"explained_variance": explained, "std": float(old_std[self.learner.acting].mean())}
-        if not calibrating:
+        if not first_rollout:
             self._update_normalizers()
         storage.clear()
         self.updates += 1
@@ -292,7 +292,7 @@ class PPO:
         self.critic.normalizer.update(self.storage.flat("privileged")[:, : self.critic.seen])
 
     @torch.no_grad()
-    def _calibrate(self) -> None:
+    def _fit_normalizers(self) -> None:
         """Fit the normalizers to the very first rollout before anything is learned from unscaled numbers.
 
         The untrained policy is almost constant, so its action means hardly change; they are computed again.

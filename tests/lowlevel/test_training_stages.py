@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from lowlevel.absorption import AbsorptionConfig, PriorTeacher, clone
 from lowlevel.commands import KINDS
 from lowlevel.curriculum import CurriculumConfig
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
+from lowlevel.imitation.cloning import CloningConfig, PriorTeacher, clone
 from lowlevel.learning.ppo import PPOConfig
 from lowlevel.networks.config import NetworkConfig
 from lowlevel.presets import PRESETS
@@ -22,7 +22,7 @@ from lowlevel.stages import Stage
 from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.randomization import RandomizationConfig
 
-QUICK = AbsorptionConfig(rounds=2, steps=4, mixed_rounds=1, gradient_steps=2, minibatch=16)
+QUICK = CloningConfig(rounds=2, steps=4, mixed_rounds=1, gradient_steps=2, minibatch=16)
 FIRST = Stage("first", "reward/alive", above=0.1, least_steps=0, std=(0.2, 0.3), prior=GaitPriorConfig())
 SECOND = Stage("second", std=(0.05, 0.1), rollout_doublings=1, arms_act=True, mixture=(("walk", 1.0),))
 
@@ -32,7 +32,7 @@ def tiny(*stages: Stage) -> TrainingConfig:
         environment=EnvironmentConfig(num_robots=8, num_threads=1),
         network=NetworkConfig(vision=False, history_hidden=(16,), expert_hidden=(16, 8), critic_hidden=(16,)),
         ppo=PPOConfig(steps_per_update=8, minibatches=2),
-        absorption=QUICK,
+        cloning=QUICK,
         stages=tuple(replace(stage, rewards=RewardWeights(alive=1.0)) for stage in stages),
     )
 
@@ -91,7 +91,7 @@ def test_absorption_teaches_the_policy_what_the_prior_did(tmp_path: Path) -> Non
     alone = PilotEnvironment(replace(trainer.environment.config, prior=None), seed=1)
     prior = GaitPrior(GaitPriorConfig())
     progress: list[float] = []
-    settings = AbsorptionConfig(rounds=12, mixed_rounds=6, minibatch=256, learning_rate=3e-3)
+    settings = CloningConfig(rounds=12, mixed_rounds=6, minibatch=256, learning_rate=3e-3)
     observation = clone(
         trainer.ppo,
         alone,

@@ -26,8 +26,8 @@ from robots.g1.constants import NUM_JOINTS
 
 
 @dataclass(frozen=True)
-class AbsorptionConfig:
-    """How long and how fast the student learns."""
+class CloningConfig:
+    """How long and how fast the student learns, after a gait prior and after a calibration."""
 
     rounds: int = 50
     """Rounds of acting and learning."""
@@ -49,7 +49,7 @@ class Teacher(Protocol):
     """What the student imitates."""
 
     def label(self, observation: dict[str, Tensor]) -> Tensor:
-        """The action to imitate (N, A); asked for once a control step."""
+        """The action to imitate (N, A) [action scales], for what the policy sees; asked for once a control step."""
 
     def forget(self, robots: Tensor) -> None:
         """An episode of the ``robots`` (N,) bool has ended."""
@@ -88,11 +88,11 @@ def _mirrored(ppo: PPO, observation: dict[str, Tensor], label: Tensor) -> tuple[
 
 
 def clone(
-    ppo: PPO, environment: PilotEnvironment, teacher: Teacher, config: AbsorptionConfig, report: Callable[[str], None]
+    ppo: PPO, environment: PilotEnvironment, teacher: Teacher, config: CloningConfig, report: Callable[[str], None]
 ) -> dict[str, Tensor]:
     """Teach the actor of ``ppo`` to act in ``environment`` as ``teacher`` would.
 
-    ``report`` is told how it goes, a line a round. Returns the observation to go on from.
+    ``report`` is told how it goes, every ten rounds. Returns the observation to go on from.
     """
     student, device = ppo.actor, ppo.device
     acting, std = ppo.learner.acting, student.log_std.exp().detach()
@@ -135,5 +135,6 @@ def clone(
             losses.append(float(loss.detach()))
         between_falls = config.steps * environment.num_robots / max(falls, 1)
         divergence = sum(losses) / len(losses)
-        report(f"cloning: {divergence:.3f} nat, falls every {between_falls:.0f} steps")
+        if round_number % 10 == 0 or round_number + 1 == config.rounds:
+            report(f"cloning: {divergence:.3f} nat, falls every {between_falls:.0f} steps")
     return observation

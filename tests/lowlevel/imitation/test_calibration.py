@@ -1,0 +1,187 @@
+"""The told velocity is corrected until the robot walks as it should."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import Tensor
+
+from lowlevel.commands import COMMAND_SIZE, MIRROR, VELOCITY, CommandSpace
+from lowlevel.control.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, columns
+from lowlevel.environment import EnvironmentConfig
+from lowlevel.gait_prior import GaitPriorConfig
+from lowlevel.imitation.calibration import CalibrationConfig, Correction, ToldTeacher, fit, measure
+from lowlevel.imitation.cloning import CloningConfig
+from lowlevel.learning.ppo import PPOConfig
+from lowlevel.networks.config import NetworkConfig
+from lowlevel.rewards import RewardWeights
+from lowlevel.stages import Stage
+from lowlevel.trainer import Trainer, TrainingConfig
+from lowlevel.world.randomization import RandomizationConfig
+
+WALKING = Stage("walk", mixture=(("walk", 1.0),), rewards=RewardWeights(alive=1.0))
+
+
+def small(*stages: Stage, robots: int = 8) -> TrainingConfig:
+    return TrainingConfig(
+        environment=EnvironmentConfig(num_robots=robots, num_threads=1, command_interval=(1.0, 1.2)),
+        network=NetworkConfig(vision=False, history_hidden=(16,), expert_hidden=(16, 8), critic_hidden=(16,)),
+        ppo=PPOConfig(steps_per_update=8, minibatches=2),
+        cloning=CloningConfig(rounds=10, steps=4, mixed_rounds=1, gradient_steps=20, minibatch=128, learning_rate=3e-3),
+        stages=tuple(replace(stage, randomization=RandomizationConfig.for_evaluation()) for stage in stages),
+    )
+
+
+@pytest.fixture
+def space(tmp_path: Path) -> CommandSpace:
+    return Trainer(small(WALKING), tmp_path).environment.command_space
+
+
+def some_commands(space: CommandSpace, count: int) -> Tensor:
+    lower, upper = space.bounds()
+    return lower + torch.rand(count, COMMAND_SIZE, generator=torch.Generator().manual_seed(0)) * (upper - lower)
+
+
+def test_a_mirrored_command_has_the_mirrored_correction_and_standing_has_none(space: CommandSpace) -> None:
+    correction = Correction(space, limit=0.5)
+    for values in correction.parameters():
+        torch.nn.init.normal_(values, std=0.3)
+    command = some_commands(space, 50)
+    index, sign = torch.as_tensor(MIRROR.index), torch.as_tensor(MIRROR.sign, dtype=command.dtype)
+    found = correction(command)
+    assert found.abs().max() > 0.1
+    assert torch.allclose(correction(command[:, index] * sign), found * sign[VELOCITY], atol=1e-6)
+    command[:, VELOCITY] = 0.02
+    assert not correction(command).any()
+
+
+def test_the_fit_finds_what_is_wanted(space: CommandSpace) -> None:
+    """A robot that walks at 0.8, 0.7 and 0.9 of what it is told."""
+    command = some_commands(space, 3000)
+    wanted = command[:, VELOCITY] * torch.tensor([0.25, 0.43, 0.11])
+    correction = Correction(space, limit=0.5)
+    explained = fit(correction, command, wanted, epochs=30, generator=torch.Generator().manual_seed(0))
+    assert min(explained) > 0.9
+
+
+class Follower:
+    """Robots that walk at a share of what their action says, along a slewed command; one of them falls at times.
+
+    For a second after a command, while the slewed one is on its way, they walk at twice the speed.
+    """
+
+    control_period = 0.02
+    lasting = 250
+
+    def __init__(self, commands: Tensor, share: Tensor) -> None:
+        self.num_robots, self.share, self.steps = len(commands), share, 0
+        self.buffers = SimpleNamespace(command=commands, reference=SimpleNamespace(command=0.0 * commands))
+
+    def reset(self, spread_episodes: bool) -> dict[str, Tensor]:
+        return {"command": self.buffers.command}
+
+    def step(self, action: Tensor) -> SimpleNamespace:
+        arrived = self.steps % self.lasting > 50
+        walked = self.share[:, None] * action * (1.0 if arrived else 2.0)
+        measured = SimpleNamespace(linear_velocity=walked, yaw_rate=walked[:, 2])
+        self.steps += 1
+        falls = torch.zeros(self.num_robots, dtype=torch.bool)
+        falls[-1] = self.steps % 100 == 0
+        if self.steps % self.lasting == 0:
+            self.buffers.command = -self.buffers.command
+        self.buffers.reference = SimpleNamespace(command=self.buffers.command * arrived)
+        observation = {"command": self.buffers.command}
+        return SimpleNamespace(observation=observation, measured=measured, terminated=falls, truncated=falls & False)
+
+
+def test_the_integrator_finds_what_a_robot_must_be_told(space: CommandSpace) -> None:
+    command = some_commands(space, 20)
+    command[:, VELOCITY] = 0.3 * torch.sign(command[:, VELOCITY])
+    command[0, VELOCITY] = 0.0
+    share = torch.full((20,), 0.8)
+    share[1] = 0.2  # would have to be told 1.5
+    teacher = SimpleNamespace(label=lambda observation, further: observation["command"][:, VELOCITY] + further)
+    follower = Follower(command, share)
+    config = CalibrationConfig(steps=2 * Follower.lasting + 1, limit=0.5)
+    told, added = measure(teacher, follower, torch.device("cpu"), config)  # type: ignore[arg-type]
+    # Neither the robot that stands nor the one that falls before its integrator has settled; the others, each twice.
+    assert torch.equal(told, torch.cat([command[1:-1], -command[1:-1]]))
+    wanted = 0.25 * told[:, VELOCITY]
+    wanted[::18] = 0.5 * torch.sign(told[::18, VELOCITY])
+    assert torch.allclose(added, wanted, atol=0.02)
+
+
+def test_the_teacher_sees_the_corrected_velocity_in_every_frame(tmp_path: Path) -> None:
+    trainer = Trainer(small(WALKING), tmp_path)
+    observation = trainer.environment.reset()
+    space = trainer.environment.command_space
+    correction = Correction(space, limit=0.5)
+    moved = torch.tensor([0.1, 0.0, 0.0])
+    with torch.no_grad():
+        list(correction.parameters())[-1][:] = moved
+    further = torch.tensor([[0.05, -0.1, 0.2]]).expand(8, 3)
+    lower, upper = (bound[VELOCITY] for bound in space.bounds())
+    history = observation["history"].view(-1, HISTORY_LENGTH + 1, FRAME_SIZE).clone()
+    buffers = trainer.environment.buffers
+    for block, command in (("command", buffers.command), ("slewed_command", buffers.reference.command)):
+        walks = command[:, VELOCITY].norm(dim=1) >= 0.1
+        assert walks.any() and not walks.all()
+        first = columns(FRAME, block).start
+        added = (further + moved * walks[:, None]) * 2.0 / (upper - lower)
+        history[:, :, first : first + 3] += added[:, None]
+    wanted = trainer.ppo.deterministic(observation | {"history": history.flatten(1)})
+    label = ToldTeacher(trainer.ppo, space, correction).label(observation, further)
+    assert torch.allclose(label, wanted, atol=1e-6)
+    assert not torch.allclose(label, trainer.ppo.deterministic(observation), atol=1e-5)
+
+
+def begun(tmp_path: Path, first: Stage, calibration: CalibrationConfig) -> tuple[Trainer, list[str]]:
+    """A trainer that has just begun a stage with calibration after ``first``, and what it reported."""
+    calibrated = replace(WALKING, name="calibrated", calibrates=True)
+    tmp_path.mkdir(exist_ok=True)
+    first = replace(first, waits_for="reward/alive", above=0.1, least_steps=0)
+    trainer = Trainer(replace(small(first, calibrated, robots=32), calibration=calibration), tmp_path)
+    trainer.observation = trainer.environment.reset()
+    lines: list[str] = []
+    trainer._follow_stages({"reward/alive": 10.0}, lines.append)
+    assert trainer.stage.name == "calibrated" and trainer.observation
+    return trainer, lines
+
+
+def parts(lines: list[str]) -> list[str]:
+    """The first words of ``lines``, those of successive ones that begin alike once."""
+    return [word for word, _ in groupby(line.split()[0] for line in lines)]
+
+
+def test_a_stage_begins_with_a_calibration(tmp_path: Path) -> None:
+    quick = CalibrationConfig(steps=250, settling=0.1, epochs=2)
+    _, lines = begun(tmp_path / "plain", WALKING, quick)
+    assert parts(lines) == ["calibrating", "calibrated", "cloning:"]
+    trainer, lines = begun(tmp_path / "prior", replace(WALKING, prior=GaitPriorConfig()), quick)
+    assert parts(lines) == ["absorbing", "cloning:", "calibrating", "calibrated", "cloning:"]
+    resumed = Trainer(trainer.config, tmp_path / "prior")
+    resumed.load()
+    assert resumed.stage.name == "calibrated"
+    for name, values in trainer.ppo.actor.state_dict().items():
+        assert torch.equal(resumed.ppo.actor.state_dict()[name], values)
+
+
+def test_without_lasting_commands_there_is_no_calibration(tmp_path: Path) -> None:
+    _, lines = begun(tmp_path, WALKING, CalibrationConfig(steps=20))
+    assert [line.split()[:2] for line in lines] == [["calibrating", "the"], ["no", "calibration:"]]
+
+
+def test_what_the_fit_knows_nothing_about_is_left_alone(space: CommandSpace) -> None:
+    command = some_commands(space, 600)
+    noise = torch.randn(600, generator=torch.Generator().manual_seed(1))
+    wanted = torch.stack([0.25 * command[:, 0], 0.3 * noise, 0.11 * command[:, 2]], dim=1)
+    correction = Correction(space, limit=0.5)
+    explained = fit(correction, command, wanted, epochs=30, generator=torch.Generator().manual_seed(0))
+    assert explained[1] < 0.0 < min(explained[0], explained[2])
+    assert correction.known.tolist() == [1.0, 0.0, 1.0]
+    assert not correction(command)[:, 1].any() and correction(command)[:, 0].any()
