@@ -198,7 +198,7 @@ class Trainer:
                 if rank() == 0:
                     self.run.log(figures, self.trained_seconds, "steps", self.steps)
                 started = time.monotonic()
-                self._follow_stages(figures, progress.console.print)
+                self._follow_stages(figures, progress.say)
                 self.trained_seconds += time.monotonic() - started
                 progress.update(task, completed=self.steps, description=self._headline(figures))
                 if time.monotonic() - last_save > self.config.save_interval:

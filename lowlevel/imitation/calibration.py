@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from lowlevel.commands import ARMS, MIRROR, VELOCITY, CommandSpace, is_walking
+from lowlevel.commands import ARMS, COMMAND_SIZE, MIRROR, VELOCITY, CommandSpace, is_walking
 from lowlevel.control.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, columns
 from lowlevel.environment import PilotEnvironment
 from lowlevel.imitation.cloning import CloningConfig, clone
@@ -53,25 +53,20 @@ class Correction(nn.Module):
 
     def __init__(self, space: CommandSpace, limit: float) -> None:
         super().__init__()
-        self.limit = limit
-        self.lower, self.upper = space.bounds()
-        size = len(space.names)
+        self.space, self.limit = space, limit
         last = nn.Linear(64, 3)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         self.known: Tensor
         self.register_buffer("known", torch.ones(3))
         """1 for each velocity about which the fit knows something, else 0 (3,)."""
-        self.net = nn.Sequential(nn.Linear(size, 128), nn.ELU(), nn.Linear(128, 64), nn.ELU(), last)
-
-    def _scaled(self, command: Tensor) -> Tensor:
-        return (2.0 * command - self.upper - self.lower) / (self.upper - self.lower)
+        self.net = nn.Sequential(nn.Linear(COMMAND_SIZE, 128), nn.ELU(), nn.Linear(128, 64), nn.ELU(), last)
 
     def forward(self, command: Tensor) -> Tensor:
         """(..., 3) [m/s, m/s, rad/s] for ``command`` (..., 21); zero for one to stand."""
         index, sign = torch.as_tensor(MIRROR.index), torch.as_tensor(MIRROR.sign, dtype=command.dtype)
-        mirrored = self.net(self._scaled(command[..., index] * sign)) * sign[VELOCITY]
-        mean = 0.5 * (self.net(self._scaled(command)) + mirrored)
+        mirrored = self.net(self.space.scaled(command[..., index] * sign)) * sign[VELOCITY]
+        mean = 0.5 * (self.net(self.space.scaled(command)) + mirrored)
         return mean.clamp(-self.limit, self.limit) * self.known * is_walking(command)[..., None]
 
 

@@ -30,3 +30,8 @@ class ProgressReport(Progress):
         self._last_line = time.monotonic()
         task = self._tasks[task_id]
         self.console.print(*(str(column(task)) for column in (*self._figures, self._description)), highlight=False)
+
+    def say(self, text: str) -> None:
+        """Print a line that stays, above the bar."""
+        if not self.disable:
+            self.console.print(text, highlight=False, markup=False)

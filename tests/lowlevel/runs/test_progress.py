@@ -29,3 +29,10 @@ def test_a_log_file_gets_lines_with_percentage_and_description(monkeypatch: pyte
 def test_lines_are_rare_and_a_terminal_gets_none(monkeypatch: pytest.MonkeyPatch) -> None:
     assert output_of(monkeypatch, interval=1000.0, terminal=False) == ""
     assert output_of(monkeypatch, interval=0.0, terminal=True) == ""
+
+
+@pytest.mark.parametrize(("hidden", "printed"), [(False, "stage [2] begins\n"), (True, "")])
+def test_what_is_said_stays_and_only_one_rank_says_it(hidden: bool, printed: str) -> None:
+    console = Console(file=io.StringIO(), width=120)
+    ProgressReport(hidden=hidden, console=console).say("stage [2] begins")
+    assert console.file.getvalue() == printed  # type: ignore[attr-defined]
