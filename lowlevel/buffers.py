@@ -32,6 +32,14 @@ class Buffers:
     hand_force: Tensor
     mean_velocity_error: Tensor
     capture_point: Tensor
+    tile_kind: Tensor
+    tile: Tensor
+    velocity_error_sum: Tensor
+    """Norm of the mean velocity error, summed over the steps of the episode."""
+    ground: Tensor
+    """Height of the ground below the base [m]."""
+    climbed: Tensor
+    """How much it has changed in the episode, up and down together [m]."""
 
     @classmethod
     def empty(cls, neutral: Tensor) -> Buffers:
@@ -57,4 +65,9 @@ class Buffers:
             hand_force=zeros(2, 3),
             mean_velocity_error=zeros(3),
             capture_point=zeros(2),
+            tile_kind=torch.zeros(n, dtype=torch.long, device=neutral.device),
+            tile=torch.zeros(n, dtype=torch.long, device=neutral.device),
+            velocity_error_sum=zeros(),
+            ground=zeros(),
+            climbed=zeros(),
         )

@@ -1,11 +1,13 @@
 """Command curriculum (paper III-B-5): every kind of command opens as far as it is tracked, and is drawn by its error.
 
 The paper opens its ranges one after the other. Here each kind of command (:data:`lowlevel.commands.KINDS`) has an
-opening of its own, and kinds that are tracked badly are drawn more often, down to a floor for all others.
+opening of its own, and kinds that are tracked badly are drawn more often, down to a floor for all others. So are kinds
+of tile (:data:`lowlevel.world.terrain.TILES`), whose levels robots climb by themselves (:mod:`lowlevel.levels`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +15,7 @@ from torch import Tensor
 
 from lowlevel.commands import KINDS
 from lowlevel.runs.distributed import sum_over_ranks
+from lowlevel.world.terrain import TILES
 
 QUALITY_TERMS = ("linear_velocity", "angular_velocity", "base_height", "torso_orientation")
 """Reward terms in [0, 1] whose mean is the quality of tracking."""
@@ -43,74 +46,122 @@ class CurriculumConfig:
     """Largest factor by which its error makes a kind more frequent than its share, or less."""
 
 
-class Curriculum:
-    """Measured tracking of each kind, and what follows from it. Tensors have one entry per kind."""
+class Tally:
+    """How well each of several classes of control steps is tracked, and how often robots fall in it.
 
-    def __init__(self, config: CurriculumConfig) -> None:
-        self.config = config
-        count = len(KINDS)
-        self.opening = torch.full((count,), config.start)
-        self.quality = torch.zeros(count)
-        self.fall_rate = torch.full((count,), FIRST_FALL_RATE)
+    Tensors have one entry per class.
+    """
+
+    def __init__(self, classes: int) -> None:
+        self.quality = torch.zeros(classes)
+        self.fall_rate = torch.full((classes,), FIRST_FALL_RATE)
         """Falls per control step."""
-        self.hardness = torch.zeros(())
-        """How hard the conditions are, in [0, 1], in stages that make them harder."""
-        self._sums = torch.zeros(3, count)
+        self._sums = torch.zeros(3, classes)
 
-    def observe(self, kind: Tensor, terms: dict[str, Tensor], fallen: Tensor) -> None:
-        """Count one step of N robots: their ``kind`` (N,), unweighted reward ``terms`` and falls (N,)."""
-        quality = torch.stack([terms[name] for name in QUALITY_TERMS]).mean(dim=0)
+    def observe(self, number: Tensor, quality: Tensor, fallen: Tensor) -> None:
+        """Count one step of N robots: its class (N,), its quality (N,), and whether the robot fell (N,)."""
         for row, values in zip(self._sums, (torch.ones_like(quality), quality, fallen.float()), strict=True):
-            row.index_add_(0, kind.cpu(), values.cpu())
+            row.index_add_(0, number.cpu(), values.cpu())
 
-    def introduce(self, kinds: Tensor) -> None:
-        """Open ``kinds`` (kinds,) bool anew, as at the start: robots that were not told them forget them."""
-        self.opening[kinds] = self.config.start
-        self.quality[kinds] = 0.0
-        self.fall_rate[kinds] = FIRST_FALL_RATE
+    def forget(self, classes: Tensor) -> None:
+        """Begin anew with ``classes`` (classes,) bool."""
+        self.quality[classes] = 0.0
+        self.fall_rate[classes] = FIRST_FALL_RATE
 
-    def update(self, hardens: bool = False) -> None:
-        """Take in what was observed since the last update, over all ranks, and open what is tracked.
-
-        The hardness moves only if the stage ``hardens``.
-        """
-        config = self.config
+    def update(self, smoothing: float) -> Tensor:
+        """Take in what was observed since the last update, over all ranks; returns the steps of each class."""
         steps, quality, falls = sum_over_ranks(self._sums)
-        seen = steps > 0
-        weight = config.smoothing * seen
+        weight = smoothing * (steps > 0)
         self.quality += weight * (quality / steps.clamp_min(1.0) - self.quality)
         self.fall_rate += weight * (falls / steps.clamp_min(1.0) - self.fall_rate)
-        falls_per_budget = self.fall_rate * config.steps_between_falls
-        grows, shrinks = (falls_per_budget < 1.0).float(), (falls_per_budget > 2.0).float()
-        change = config.growth * (grows * (self.quality > config.quality) - shrinks) * seen
-        self.opening = (self.opening + change).clamp(config.start, 1.0)
-        if hardens:
-            falls_per_budget = (self.fall_rate * steps).sum() / steps.sum() * config.hard_steps_between_falls
-            change = config.growth * ((falls_per_budget < 1.0).float() - (falls_per_budget > 2.0).float())
-            self.hardness = (self.hardness + change).clamp(0.0, 1.0)
         self._sums = torch.zeros_like(self._sums)
+        return steps
 
-    def probabilities(self, shares: Tensor) -> Tensor:
-        """Chance of each kind: its share (kinds,), more often where tracking lacks more."""
+    def chances(self, shares: Tensor, most_often: float) -> Tensor:
+        """Chance of each class: its share, times a factor of at most ``most_often`` where tracking lacks more."""
         lack = (1.0 - self.quality).clamp_min(0.05)
-        mean = (shares * lack).sum()
-        factor = (lack / mean).clamp(1.0 / self.config.most_often, self.config.most_often)
+        factor = (lack / (shares * lack).sum()).clamp(1.0 / most_often, most_often)
         return shares * factor / (shares * factor).sum()
 
-    def figures(self, shares: Tensor) -> dict[str, float]:
-        """Hardness, and openings, qualities and falls of the kinds that are drawn, by name."""
-        result = {"hardness": float(self.hardness)}
-        for number, name in enumerate(KINDS):
+    def figures(self, names: Iterable[str], shares: Tensor) -> dict[str, float]:
+        """Quality and control steps between falls of the classes that are drawn, by name."""
+        result = {}
+        for number, name in enumerate(names):
             if shares[number] > 0.0:
-                result[f"opening/{name}"] = float(self.opening[number])
                 result[f"quality/{name}"] = float(self.quality[number])
                 result[f"steps_between_falls/{name}"] = float(1.0 / self.fall_rate[number].clamp_min(1e-6))
         return result
 
+
+class Curriculum:
+    """Measured tracking of each kind of command and of tile, and what follows from it."""
+
+    def __init__(self, config: CurriculumConfig) -> None:
+        self.config = config
+        self.kinds, self.tiles = Tally(len(KINDS)), Tally(len(TILES))
+        self.opening = torch.full((len(KINDS),), config.start)
+        """Of each kind of command."""
+        self.hardness = torch.zeros(())
+        """How hard the conditions are, in [0, 1], in stages that make them harder."""
+
+    def observe(self, kind: Tensor, tile: Tensor, terms: dict[str, Tensor], fallen: Tensor) -> None:
+        """Count one step of N robots: their kinds of command and tile (N,), unweighted reward ``terms``, falls (N,)."""
+        quality = torch.stack([terms[name] for name in QUALITY_TERMS]).mean(dim=0)
+        self.kinds.observe(kind, quality, fallen)
+        self.tiles.observe(tile, quality, fallen)
+
+    def introduce(self, kinds: Tensor) -> None:
+        """Open ``kinds`` (kinds,) bool anew, as at the start: robots that were not told them forget them."""
+        self.opening[kinds] = self.config.start
+        self.kinds.forget(kinds)
+
+    def update(self, hardens: bool = False) -> None:
+        """Take in what was observed since the last update, and open what is tracked.
+
+        The hardness moves only if the stage ``hardens``.
+        """
+        config = self.config
+        self.tiles.update(config.smoothing)
+        steps = self.kinds.update(config.smoothing)
+        falls_per_budget = self.kinds.fall_rate * config.steps_between_falls
+        grows, shrinks = (falls_per_budget < 1.0).float(), (falls_per_budget > 2.0).float()
+        change = config.growth * (grows * (self.kinds.quality > config.quality) - shrinks) * (steps > 0)
+        self.opening = (self.opening + change).clamp(config.start, 1.0)
+        if hardens:
+            falls_per_budget = (self.kinds.fall_rate * steps).sum() / steps.sum() * config.hard_steps_between_falls
+            change = config.growth * ((falls_per_budget < 1.0).float() - (falls_per_budget > 2.0).float())
+            self.hardness = (self.hardness + change).clamp(0.0, 1.0)
+
+    def kind_chances(self, shares: Tensor) -> Tensor:
+        """Chance of each kind of command: its share (kinds,), more often where tracking lacks more."""
+        return self.kinds.chances(shares, self.config.most_often)
+
+    def tile_chances(self, shares: Tensor) -> Tensor:
+        """Chance of each kind of tile, alike."""
+        return self.tiles.chances(shares, self.config.most_often)
+
+    def figures(self, kind_shares: Tensor, tile_shares: Tensor) -> dict[str, float]:
+        """Hardness, and openings, qualities and falls of the kinds that are drawn, by name."""
+        result = {"hardness": float(self.hardness)}
+        opened = zip(KINDS, self.opening.tolist(), kind_shares.tolist(), strict=True)
+        result |= {f"opening/{name}": opening for name, opening, share in opened if share > 0.0}
+        return result | self.kinds.figures(KINDS, kind_shares) | self.tiles.figures(TILES, tile_shares)
+
     def state_dict(self) -> dict[str, Tensor]:
-        names = ("opening", "quality", "fall_rate", "hardness")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(holder, attribute) for name, (holder, attribute) in self._saved.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        for name in self.state_dict():
-            setattr(self, name, state[name].clone())
+        for name, (holder, attribute) in self._saved.items():
+            setattr(holder, attribute, state[name].clone())
+
+    @property
+    def _saved(self) -> dict[str, tuple[object, str]]:
+        """Name in a saved state to whose attribute it is."""
+        return {
+            "opening": (self, "opening"),
+            "hardness": (self, "hardness"),
+            "quality": (self.kinds, "quality"),
+            "fall_rate": (self.kinds, "fall_rate"),
+            "tile_quality": (self.tiles, "quality"),
+            "tile_fall_rate": (self.tiles, "fall_rate"),
+        }

@@ -32,11 +32,12 @@ from lowlevel.control.observation import (
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.control.stepping import swing_first
 from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
+from lowlevel.levels import Levels
 from lowlevel.rewards import RewardWeights, Transition, compute_rewards
 from lowlevel.world.measures import Measurement, is_lost, velocity_error, with_rows
 from lowlevel.world.privileged import PRIVILEGED, PrivilegedView
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
-from lowlevel.world.terrain import TerrainConfig
+from lowlevel.world.terrain import TerrainConfig, tile_shares
 from lowlevel.world.world import World
 from robots.g1.constants import ARM_JOINTS, NUM_JOINTS, gain_set
 from robots.g1.model import ModelOptions
@@ -105,6 +106,8 @@ class StepResult:
     """The clamped command that the step tracked (N, 21)."""
     kind: Tensor
     """Number of its kind in KINDS (N,)."""
+    tile_kind: Tensor
+    """Number of the kind of tile on which the episode began in TILES (N,)."""
     surprised: Tensor
     """Whether a new command or a push follows (N,), which neither policy nor critic could foresee."""
 
@@ -139,6 +142,9 @@ class PilotEnvironment:
         """Chance of each kind of command (kinds,); the curriculum moves it."""
         self.opening = torch.ones(len(KINDS), device=device)
         """How far each kind is open (kinds,), in [0, 1]; the curriculum moves it."""
+        self.tile_probability = tile_shares(config.terrain, device)
+        """Chance of each kind of tile (kinds of tile,); the curriculum moves it."""
+        self.levels = Levels(self.world.terrain, config.num_robots, device)
         self._noise = config.noise.proprioception().to(device)
         self._step_count = 0
         neutral = self.command_space.neutral(self.device)
@@ -161,6 +167,7 @@ class PilotEnvironment:
             self.buffers.episode_step = torch.randint(
                 self.max_steps, (self.num_robots,), generator=self.generator, device=self.device
             )
+            self.buffers.velocity_error_sum[:] = torch.inf  # what is left of these episodes proves nothing
         self._advance_reference()
         measured = self.world.measure()
         return self._observe(measured, self._seen_ground(measured), everyone)
@@ -182,6 +189,7 @@ class PilotEnvironment:
         self._update_foot_times(measured)
         error = velocity_error(measured, buffers.reference.command)
         buffers.mean_velocity_error = torch.lerp(buffers.mean_velocity_error, error, self.control_period / AVERAGING)
+        self._update_progress(measured)
         fallen = is_lost(measured, buffers.reference.command) | self.simulation.diverged()
         truncated = (buffers.episode_step >= self.max_steps) & ~fallen
         transition = Transition(
@@ -200,13 +208,14 @@ class PilotEnvironment:
             fallen=fallen,
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
-        command, kind = buffers.command, buffers.kind.clone()
+        command, kind, tile_kind = buffers.command, buffers.kind.clone(), buffers.tile_kind.clone()
         # The frozen controller goes by the policy's estimate of the capture point.
         buffers.reference = self.reference.begin_step(buffers.reference, swing_first(measured.capture_point))
         next_privileged = build(PRIVILEGED, self._view(measured, ground))
 
         done, now = torch.nonzero(fallen | truncated)[:, 0], measured
         if len(done):
+            self._judge(done, fallen[done])
             self._reset_robots(done)
             fresh = self.world.measure(done)
             now = with_rows(measured, done, fresh)
@@ -225,6 +234,7 @@ class PilotEnvironment:
             measured=measured,
             command=command,
             kind=kind,
+            tile_kind=tile_kind,
             surprised=surprised,
         )
 
@@ -250,6 +260,20 @@ class PilotEnvironment:
         self.buffers.foot_contact_time = torch.where(contact, self.buffers.foot_contact_time + period, 0.0)
         self.buffers.foot_air_time = torch.where(contact, 0.0, self.buffers.foot_air_time + period)
 
+    def _update_progress(self, measured: Measurement) -> None:
+        buffers = self.buffers
+        buffers.velocity_error_sum += buffers.mean_velocity_error[:, :2].norm(dim=1)
+        ground = self.world.terrain.height(measured.robot.base_position[:, :2])
+        buffers.climbed += (ground - buffers.ground).abs()
+        buffers.ground = ground
+
+    def _judge(self, ids: Tensor, fallen: Tensor) -> None:
+        """Let robots ``ids`` (n,), whose episodes are over, change their level."""
+        buffers = self.buffers
+        error = buffers.velocity_error_sum[ids] / buffers.episode_step[ids]
+        kind, tile, climbed = buffers.tile_kind[ids], buffers.tile[ids], buffers.climbed[ids]
+        self.levels.judge(ids, kind, tile, fallen, error, climbed, self.generator)
+
     def _resample_due_commands(self) -> Tensor:
         """Give new commands to robots whose time with the old one is over; returns which (N,)."""
         self.buffers.command_countdown -= self.control_period
@@ -267,7 +291,7 @@ class PilotEnvironment:
         self.buffers.command_countdown[ids] = self._uniform(*self.config.command_interval, len(ids))
 
     def _reset_robots(self, ids: Tensor) -> None:
-        """Start new episodes on random tiles, headings and commands."""
+        """Start new episodes on tiles of the robots' levels, at random places, headings and commands."""
         buffers, count = self.buffers, len(ids)
         self._sample_commands(ids)
         in_posture = self._uniform(0.0, 1.0, count, 1) < self.config.start_in_posture
@@ -280,10 +304,9 @@ class PilotEnvironment:
 
         heading = self._uniform(-torch.pi, torch.pi, count)
         joint_spread = self._uniform(-0.02, 0.02, count, NUM_JOINTS)
-        centers = self.world.terrain.tile_centers
-        tile = torch.randint(len(centers), (count,), generator=self.generator, device=self.device)
+        tile_kind, tile = self.levels.draw(ids, self.tile_probability, self.generator)
         reach = 0.5 * self.config.terrain.tile_size - 1.0
-        xy = centers[tile] + self._uniform(-reach, reach, count, 2)
+        xy = self.world.terrain.tile_centers[tile] + self._uniform(-reach, reach, count, 2)
         base_velocity = torch.zeros(count, 6, device=self.device)
         fastest = self.randomizer.config.start_velocity
         base_velocity[:, :3] = self._uniform(-fastest, fastest, count, 3)
@@ -296,6 +319,9 @@ class PilotEnvironment:
         buffers.foot_air_time[ids], buffers.foot_contact_time[ids] = 0.0, 0.0
         buffers.mean_velocity_error[ids] = 0.0
         buffers.episode_step[ids] = 0
+        buffers.tile_kind[ids], buffers.tile[ids] = tile_kind, tile
+        buffers.velocity_error_sum[ids], buffers.climbed[ids] = 0.0, 0.0
+        buffers.ground[ids] = self.world.terrain.height(xy)
 
     # -- observation ------------------------------------------------------------------------------------------
 
@@ -350,6 +376,7 @@ class PilotEnvironment:
             "buffers": {f.name: getattr(self.buffers, f.name) for f in fields(Buffers) if f.name != "reference"},
             "reference": self.buffers.reference._asdict(),
             "randomization": {f.name: getattr(self.randomizer.state, f.name) for f in fields(self.randomizer.state)},
+            "levels": self.levels.reached,
             "generator": self.generator.get_state(),
             "step_count": self._step_count,
         }
@@ -362,5 +389,6 @@ class PilotEnvironment:
         self.buffers.reference = ReferenceState(**{name: value.clone() for name, value in state["reference"].items()})
         for name, value in state["randomization"].items():
             setattr(self.randomizer.state, name, value.clone())
+        self.levels.reached = state["levels"].clone()
         self.generator.set_state(state["generator"])
         self._step_count = state["step_count"]

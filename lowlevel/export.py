@@ -17,6 +17,7 @@ from lowlevel.networks.actor import PilotActor
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.run_folder import RunFolder, git_revision
 from lowlevel.trainer import Trainer, TrainingConfig
+from lowlevel.world.terrain import tile_shares
 from robots.errors import PilotError
 from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, GAINS, JOINT_NAMES
 
@@ -60,7 +61,7 @@ def export_controller(trainer: Trainer, folder: Path, revision: str | None = Non
         "steps": trainer.steps,
         "hours": trainer.trained_seconds / 3600.0,
         "stage": trainer.stage.name,
-        "curriculum": trainer.curriculum.figures(torch.ones(len(KINDS))),
+        "curriculum": trainer.curriculum.figures(torch.ones(len(KINDS)), tile_shares(trainer.stage.terrain)),
         "revision": git_revision() if revision is None else revision,
         "torch": torch.__version__,
     }

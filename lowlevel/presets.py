@@ -155,6 +155,7 @@ STAGES = (
         above=0.98,
         most_steps=15_000_000,
         std=(0.05, 0.1),
+        prior=ANSWERS,
         mixture=(("steer", 0.3), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.5)),
         rewards=STEPPING,
         randomization=GENTLE,

@@ -35,6 +35,7 @@ from lowlevel.stages import Stage
 from lowlevel.world.measures import TRACKING_FIGURES
 from lowlevel.world.privileged import MIRRORS, PRIVILEGED, PRIVILEGED_SIZE
 from lowlevel.world.randomization import between
+from lowlevel.world.terrain import tile_shares
 from robots.errors import PilotError
 from robots.g1.constants import LOWER_JOINTS, NUM_JOINTS
 
@@ -131,7 +132,7 @@ class Trainer:
         stage = self.stage
         seed = self.config.seed + 7919 * rank() + 104729 * number
         self.environment = PilotEnvironment(stage.environment(self.config.environment), seed=seed, device="cpu")
-        self._shares = shares(stage.mixture)
+        self._shares, self._tile_shares = shares(stage.mixture), tile_shares(stage.terrain)
         acting = NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop
         self.ppo.enter(stage.std, acting, stage.rollout_doublings, stage.gait_noise, stage.normalizes_by_kind)
         self._apply_curriculum()
@@ -144,7 +145,8 @@ class Trainer:
 
     def _apply_curriculum(self) -> None:
         self.environment.opening = self.curriculum.opening
-        self.environment.kind_probability = self.curriculum.probabilities(self._shares)
+        self.environment.kind_probability = self.curriculum.kind_chances(self._shares)
+        self.environment.tile_probability = self.curriculum.tile_chances(self._tile_shares)
         easy, hard = self.stage.randomization, self.stage.harder
         if hard is not None:
             self.environment.randomizer.config = between(easy, hard, float(self.curriculum.hardness))
@@ -221,7 +223,7 @@ class Trainer:
             interrupted = result.truncated | result.surprised
             self.ppo.record(result.reward, result.terminated, interrupted, result.next_privileged, result.kind)
             self.observation = result.observation
-            self.curriculum.observe(result.kind, result.terms, result.terminated)
+            self.curriculum.observe(result.kind, result.tile_kind, result.terms, result.terminated)
             terms.add(result.terms | {"total": result.reward / self.environment.control_period})
             falls.add({"share": result.terminated})
             tracking.add(_tracking(result))
@@ -238,7 +240,8 @@ class Trainer:
         self._apply_curriculum()
         figures = {f"reward/{name}": value for name, value in mean_terms.items()}
         figures |= {f"tracking/{name}": value for name, value in tracking.take().items()}
-        figures |= {f"curriculum/{name}": value for name, value in self.curriculum.figures(self._shares).items()}
+        curriculum = self.curriculum.figures(self._shares, self._tile_shares) | self.environment.levels.figures()
+        figures |= {f"curriculum/{name}": value for name, value in curriculum.items()}
         figures["curriculum/stage"] = float(self.stage_number)
         figures |= {f"learner/{name}": value for name, value in losses.items()}
         figures["episode/steps_between_falls"] = steps_between_falls

@@ -127,10 +127,17 @@ class TerrainConfig:
     """Seed of the random tiles."""
 
 
+def tile_shares(config: TerrainConfig, device: torch.device | str = "cpu") -> Tensor:
+    """Equal shares of the kinds of tile in ``config``, (kinds,) in the order of :data:`TILES`."""
+    present = torch.tensor([name in config.tiles for name in TILES], dtype=torch.float32, device=device)
+    return present / present.sum()
+
+
 class Terrain:
     """Blocks, the height raster built from them, and lookups on it.
 
-    ``tile_centers`` (tiles, 2) [m]: those of the first kind first, from the first level to the last.
+    ``tile_centers`` (tiles, 2) [m]: those of the first kind first, from the first level to the last. ``relief``
+    (tiles,) [m/m]: how much the ground rises and sinks along a line across a tile, per meter.
     """
 
     def __init__(self, config: TerrainConfig, device: torch.device | str = "cpu") -> None:
@@ -148,8 +155,10 @@ class Terrain:
             centers.append((float(x), float(y)))
             self.blocks += [block.moved(float(x), float(y)) for block in TILES[tile](size, level, rng)]
         self.tile_centers = torch.tensor(centers, dtype=torch.float32, device=device)
+        raster = self._rasterize(extent)
+        self.relief = torch.tensor([self._relief(raster, center) for center in centers], device=device)
         # The outermost cells stand for the plane around the tiles.
-        self._raster = torch.from_numpy(np.pad(self._rasterize(extent), 1)).to(device)
+        self._raster = torch.from_numpy(np.pad(raster, 1)).to(device)
         self._map_offsets = map_points(device)
 
     def _rasterize(self, extent: np.ndarray) -> np.ndarray:
@@ -166,6 +175,15 @@ class Terrain:
             heights = block.height(x[:, None], y[None])
             np.maximum(cells, heights, out=cells, casting="same_kind")
         return raster
+
+    def _relief(self, raster: np.ndarray, center: tuple[float, float]) -> float:
+        """Mean change of height per meter on the tile at ``center``, along both axes."""
+        half, resolution = self.config.tile_size / 2.0, self.config.raster_resolution
+        low = np.round((np.array(center) - half - self._origin.cpu().numpy()) / resolution).astype(int)
+        cells = round(2.0 * half / resolution)
+        tile = raster[low[0] : low[0] + cells, low[1] : low[1] + cells]
+        changes = [np.abs(np.diff(tile, axis=axis)).mean() for axis in (0, 1)]
+        return float(np.mean(changes)) / resolution
 
     def add_to(self, spec: mujoco.MjSpec, friction: float = 1.0) -> None:
         """Add the blocks as static geoms that feet and objects collide with."""

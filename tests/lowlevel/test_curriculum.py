@@ -5,6 +5,7 @@ import torch
 
 from lowlevel.commands import KINDS, shares
 from lowlevel.curriculum import QUALITY_TERMS, Curriculum, CurriculumConfig
+from lowlevel.world.terrain import TILES
 
 NAMES = list(KINDS)
 
@@ -14,7 +15,8 @@ def see(curriculum: Curriculum, quality: dict[str, float], fall_rate: float = 0.
     for name, value in quality.items():
         kind = torch.full((1000,), NAMES.index(name))
         fallen = torch.arange(1000) < 1000 * fall_rate
-        curriculum.observe(kind, {term: torch.full((1000,), value) for term in QUALITY_TERMS}, fallen)
+        terms = {term: torch.full((1000,), value) for term in QUALITY_TERMS}
+        curriculum.observe(kind, torch.zeros_like(kind), terms, fallen)
     curriculum.update()
 
 
@@ -45,7 +47,7 @@ def test_what_is_tracked_badly_is_drawn_more_often_down_to_a_floor() -> None:
     mixture = shares((("walk", 0.25), ("stand", 0.25), ("squat", 0.5)))
     for _ in range(100):
         see(curriculum, {"walk": 0.2, "stand": 0.9, "squat": 0.6})
-    chance = dict(zip(NAMES, curriculum.probabilities(mixture).tolist(), strict=True))
+    chance = dict(zip(NAMES, curriculum.kind_chances(mixture).tolist(), strict=True))
     assert sum(chance.values()) == pytest.approx(1.0)
     assert chance["walk"] > 0.25 > chance["stand"] >= 0.25 / 2.0 / 2.0
     assert chance["forward"] == 0.0
@@ -56,7 +58,7 @@ def test_conditions_become_harder_while_few_robots_fall_and_only_where_they_may(
     kind, quality = torch.zeros(1000, dtype=torch.long), {term: torch.ones(1000) for term in QUALITY_TERMS}
 
     def update(fall_rate: float, hardens: bool = True) -> float:
-        curriculum.observe(kind, quality, torch.arange(1000) < 1000 * fall_rate)
+        curriculum.observe(kind, kind, quality, torch.arange(1000) < 1000 * fall_rate)
         curriculum.update(hardens)
         return float(curriculum.hardness)
 
@@ -84,4 +86,20 @@ def test_state_round_trip() -> None:
     for _ in range(10):
         see(curriculum, {"walk": 0.9})
     other.load_state_dict(curriculum.state_dict())
-    assert other.figures(torch.ones(len(KINDS))) == curriculum.figures(torch.ones(len(KINDS)))
+    every = torch.ones(len(KINDS)), torch.ones(len(TILES))
+    assert other.figures(*every) == curriculum.figures(*every)
+
+
+def test_tiles_are_drawn_by_what_they_lack_too() -> None:
+    curriculum = Curriculum(CurriculumConfig())
+    tile_shares = torch.tensor([name in ("flat", "stairs") for name in TILES]) / 2.0
+    for number, quality in ((0, 0.8), (list(TILES).index("stairs"), 0.4)):
+        terms = {term: torch.full((100,), quality) for term in QUALITY_TERMS}
+        curriculum.observe(torch.zeros(100, dtype=torch.long), torch.full((100,), number), terms, torch.zeros(100))
+    for _ in range(100):
+        curriculum.update()
+    chance = dict(zip(TILES, curriculum.tile_chances(tile_shares).tolist(), strict=True))
+    assert chance["stairs"] > chance["flat"] > 0.2 and chance["platform"] == 0.0
+    assert {"quality/stairs", "steps_between_falls/flat"} <= curriculum.figures(
+        torch.ones(len(KINDS)), tile_shares
+    ).keys()

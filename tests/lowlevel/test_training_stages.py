@@ -130,7 +130,7 @@ def test_a_stage_makes_its_conditions_harder(tmp_path: Path) -> None:
     )
     assert trainer.environment.randomizer.config == easy
     trainer.observation = trainer.environment.reset()
-    trainer.curriculum.fall_rate.zero_()
+    trainer.curriculum.kinds.fall_rate.zero_()
     hardness = trainer.iterate()["curriculum/hardness"]
     assert hardness == pytest.approx(CurriculumConfig().growth)
     assert trainer.environment.randomizer.config.push_velocity == pytest.approx(2.0 * hardness)
