@@ -10,6 +10,7 @@ from torch import Tensor
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import FRAME_SIZE, HISTORY_LENGTH
 from lowlevel.control.reference import ReferenceState
+from lowlevel.world.randomization import MOST_MAP_DELAY
 from robots.g1.constants import NUM_JOINTS
 
 
@@ -26,7 +27,8 @@ class Buffers:
     previous_action: Tensor
     reference: ReferenceState
     history: Tensor
-    elevation: Tensor
+    maps: Tensor
+    """The elevation maps taken last, the newest first (N, MOST_MAP_DELAY + 1, 121)."""
     foot_air_time: Tensor
     foot_contact_time: Tensor
     hand_force: Tensor
@@ -59,7 +61,7 @@ class Buffers:
             previous_action=zeros(NUM_JOINTS),
             reference=ReferenceState.standing(neutral.clone()),
             history=zeros(HISTORY_LENGTH + 1, FRAME_SIZE),
-            elevation=zeros(MAP_SIZE),
+            maps=zeros(MOST_MAP_DELAY + 1, MAP_SIZE),
             foot_air_time=zeros(2),
             foot_contact_time=zeros(2),
             hand_force=zeros(2, 3),

@@ -147,6 +147,7 @@ class PilotEnvironment:
         self.levels = Levels(self.world.terrain, config.num_robots, device)
         self._noise = config.noise.proprioception().to(device)
         self._step_count = 0
+        self._everyone = torch.arange(config.num_robots, device=self.device)
         neutral = self.command_space.neutral(self.device)
         self.buffers = Buffers.empty(neutral.repeat(config.num_robots, 1))
 
@@ -161,8 +162,7 @@ class PilotEnvironment:
 
     def reset(self, spread_episodes: bool = False) -> dict[str, Tensor]:
         """Reset all robots; with ``spread_episodes`` time limits are spread so that they do not coincide."""
-        everyone = torch.arange(self.num_robots, device=self.device)
-        self._reset_robots(everyone)
+        self._reset_robots(self._everyone)
         if spread_episodes:
             self.buffers.episode_step = torch.randint(
                 self.max_steps, (self.num_robots,), generator=self.generator, device=self.device
@@ -170,7 +170,7 @@ class PilotEnvironment:
             self.buffers.velocity_error_sum[:] = torch.inf  # what is left of these episodes proves nothing
         self._advance_reference()
         measured = self.world.measure()
-        return self._observe(measured, self._seen_ground(measured), everyone)
+        return self._observe(measured, self._seen_ground(measured), self._everyone)
 
     def step(self, action: Tensor) -> StepResult:
         """Apply residual ``action`` (N, 29), in action scales, for one control step of 0.02 s."""
@@ -354,17 +354,22 @@ class PilotEnvironment:
         if len(new_episodes):
             buffers.history[new_episodes] = start_history(frame[new_episodes])
         if self._step_count % MAP_REFRESH_STEPS == 0:
-            buffers.elevation = self._noisy(ground)
-        elif len(new_episodes):
-            buffers.elevation[new_episodes] = self._noisy(ground[new_episodes])
+            self.randomizer.wander()
+            newest = self._take_maps(measured, self._everyone)
+            buffers.maps = torch.cat([newest[:, None], buffers.maps[:, :-1]], dim=1)
+        if len(new_episodes):
+            buffers.maps[new_episodes] = self._take_maps(measured, new_episodes)[:, None]
         return {
             "history": buffers.history.flatten(1),
-            "elevation_map": buffers.elevation,
+            "elevation_map": buffers.maps[self._everyone, self.randomizer.state.map_delay],
             "flag": buffers.flag.clone(),
             "privileged": build(PRIVILEGED, view),
         }
 
-    def _noisy(self, elevation: Tensor) -> Tensor:
+    def _take_maps(self, measured: Measurement, ids: Tensor) -> Tensor:
+        """Elevation maps of this moment (n, 121) of robots ``ids`` (n,): from where they think they are, with noise."""
+        position = measured.robot.base_position[ids] + self.randomizer.state.map_error[ids]
+        elevation = map_observation(self.world.terrain.elevation_map(position, measured.heading[ids]))
         return elevation + self.config.noise.elevation * self._uniform(-1.0, 1.0, *elevation.shape)
 
     # -- saving -----------------------------------------------------------------------------------------------

@@ -60,6 +60,9 @@ GENTLE = RandomizationConfig(
     push_velocity=0.15,
     delay=(0.7, 0.3, 0.0),
     waist_effort=(50.0, 50.0),
+    map_offset=0.0,
+    map_drift=0.0,
+    map_delay=(1.0, 0.0, 0.0),
 )
 """For a robot that still learns to walk, or what falls without any push."""
 

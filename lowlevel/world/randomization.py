@@ -17,6 +17,10 @@ _RANDOMIZED_BODIES = (PELVIS_BODY, TORSO_BODY)
 _WAIST_MOTORS = ("waist_roll_joint", "waist_pitch_joint")
 MOST_DELAY = 2
 """Longest latency from sensor to motor [control steps of 20 ms]."""
+MOST_MAP_DELAY = 2
+"""Longest age of an elevation map that arrives [refreshes of 100 ms]."""
+DRIFT_STEP = 0.005
+"""Largest step of the wandering map error from one refresh to the next, per axis [m]."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,13 @@ class RandomizationConfig:
     """Largest horizontal velocity change of a push, per axis [m/s]."""
     push_interval: tuple[float, float] = (4.0, 8.0)
     """Time between pushes [s]."""
+    map_offset: float = 0.05
+    """Half-width of the vertical error of an episode's elevation maps [m] (AME-2, arXiv 2601.08485)."""
+    map_drift: float = 0.05
+    """Largest horizontal error of the maps, per axis [m]: that of the estimated position, which wanders."""
+    map_delay: tuple[float, float, float] = (0.4, 0.4, 0.2)
+    """Chances that a robot's maps are 0, 100 and 200 ms old when they arrive (InternRobotics/Gallant has a LiDAR's at 120
+    to 280 ms)."""
 
     @classmethod
     def for_evaluation(cls) -> RandomizationConfig:
@@ -67,6 +78,9 @@ class RandomizationConfig:
             hand_load_probability=0.0,
             start_velocity=0.0,
             push_velocity=0.0,
+            map_offset=0.0,
+            map_drift=0.0,
+            map_delay=(1.0, 0.0, 0.0),
         )
 
 
@@ -101,6 +115,10 @@ class RandomizationState:
     """Downward and inward force per hand (N, 2) [N]."""
     push_countdown: Tensor
     """Time to the next push (N,) [s]."""
+    map_error: Tensor
+    """Where the maps are taken, from where they should be (N, 3) [m], world frame."""
+    map_delay: Tensor
+    """Age of the maps when they arrive (N,) [refreshes], integer."""
 
 
 class Randomizer:
@@ -133,11 +151,24 @@ class Randomizer:
             past_targets=torch.zeros(count, MOST_DELAY, NUM_JOINTS, device=device),
             hand_load=torch.zeros(count, 2, device=device),
             push_countdown=torch.full((count,), np.inf, device=device),
+            map_error=torch.zeros(count, 3, device=device),
+            map_delay=torch.zeros(count, dtype=torch.long, device=device),
         )
 
     def _uniform(self, low: float, high: float, *shape: int) -> Tensor:
         random = torch.rand(*shape, generator=self.generator, device=self.generator.device)
         return (low + (high - low) * random).to(self.simulation.device)
+
+    def _choice(self, chances: tuple[float, ...], count: int) -> Tensor:
+        """Numbers (count,) drawn by their chances."""
+        drawn = torch.multinomial(torch.tensor(chances), count, replacement=True, generator=self.generator)
+        return drawn.to(self.simulation.device)
+
+    def wander(self) -> None:
+        """Let the horizontal error of the maps wander from one refresh to the next."""
+        error, limit = self.state.map_error, self.config.map_drift
+        step = min(DRIFT_STEP, limit) * self._uniform(-1.0, 1.0, len(error), 2)
+        error[:, :2] = (error[:, :2] + step).clamp(-limit, limit)
 
     def delayed(self, target: Tensor) -> Tensor:
         """The targets (N, 29) [rad] that reach the motors now, of ``target`` (N, 29) and the ones before it."""
@@ -156,13 +187,16 @@ class Randomizer:
         state.friction[ids] = self._uniform(*config.friction, count, 1)
         state.added_mass[ids] = self._uniform(*config.added_mass, count, 2)
         state.joint_offset[ids] = self._uniform(-config.joint_offset, config.joint_offset, count, NUM_JOINTS)
-        chances = torch.tensor(config.delay)
-        state.delay[ids] = torch.multinomial(chances, count, replacement=True, generator=self.generator)
+        state.delay[ids] = self._choice(config.delay, count)
         carries = (self._uniform(0.0, 1.0, count, 1) < config.hand_load_probability).float()
         load = [self._uniform(*config.hand_payload, count), self._uniform(*config.hand_squeeze, count)]
         state.hand_load[ids] = torch.stack(load, -1) * carries
         if config.push_velocity > 0.0:
             state.push_countdown[ids] = self._uniform(*config.push_interval, count)
+
+        spread = torch.tensor([config.map_drift, config.map_drift, config.map_offset], device=ids.device)
+        state.map_error[ids] = spread * self._uniform(-1.0, 1.0, count, 3)
+        state.map_delay[ids] = self._choice(config.map_delay, count)
 
         friction = self.simulation.per_robot("geom_friction")
         friction[rows[:, None], self._foot_geoms, 0] = state.friction[ids].cpu().numpy()

@@ -16,6 +16,7 @@ from lowlevel.control.observation import (
     FRAME,
     FRAME_SIZE,
     HISTORY_LENGTH,
+    MAP_REFRESH_STEPS,
     NoiseConfig,
     columns,
 )
@@ -28,7 +29,7 @@ from lowlevel.stages import Stage
 from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.measures import TRACKING_FIGURES
 from lowlevel.world.privileged import MIRRORS, PRIVILEGED, PRIVILEGED_SIZE
-from lowlevel.world.randomization import RandomizationConfig
+from lowlevel.world.randomization import DRIFT_STEP, RandomizationConfig
 from lowlevel.world.terrain import TerrainConfig
 from robots.rotations import rotate_about_vertical
 
@@ -132,6 +133,43 @@ def test_targets_reach_the_motors_as_late_as_drawn() -> None:
     sent = [torch.full((6, 29), float(number)) for number in range(4)]
     arrived = [environment.randomizer.delayed(target)[:, 0].tolist() for target in sent]
     assert arrived[2:] == [[2.0, 1.0, 0.0, 2.0, 1.0, 0.0], [3.0, 2.0, 1.0, 3.0, 2.0, 1.0]]
+
+
+def test_maps_are_refreshed_at_10_hz_and_arrive_as_late_and_as_wrong_as_drawn() -> None:
+    stairs = TerrainConfig(tiles=("stairs",), levels=(1.0,))
+    environment = PilotEnvironment(replace(QUIET, terrain=stairs))
+    environment.reset()
+    drawn = environment.randomizer.state
+    drawn.map_delay = torch.tensor([0, 0, 1, 1, 2, 2])
+    drawn.map_error = torch.zeros(6, 3)
+    drawn.map_error[1:, 2] = 0.03
+    taken, seen = [], []
+    for _ in range(4 * MAP_REFRESH_STEPS):
+        result = environment.step(torch.zeros(6, 29))
+        taken.append(environment._seen_ground(result.measured))
+        seen.append(result.observation["elevation_map"])
+    for step in range(3 * MAP_REFRESH_STEPS, 4 * MAP_REFRESH_STEPS):
+        # The map is taken with every fifth observation after the first, which the reset returned.
+        newest = (step + 1) // MAP_REFRESH_STEPS * MAP_REFRESH_STEPS - 1
+        for robot in range(6):
+            when = newest - MAP_REFRESH_STEPS * int(drawn.map_delay[robot])
+            expected = taken[when][robot] + drawn.map_error[robot, 2]
+            assert torch.allclose(seen[step][robot], expected.clamp(-1.0, 1.0), atol=1e-5), (step, robot)
+
+
+def test_the_error_of_a_map_wanders_within_its_bounds() -> None:
+    environment = PilotEnvironment(SMALL)
+    environment.reset()
+    randomizer, limit = environment.randomizer, environment.randomizer.config.map_drift
+    first = randomizer.state.map_error.clone()
+    steps = []
+    for _ in range(300):
+        before = randomizer.state.map_error.clone()
+        randomizer.wander()
+        steps.append((randomizer.state.map_error - before).abs())
+    last = randomizer.state.map_error
+    assert torch.equal(last[:, 2], first[:, 2]) and not torch.allclose(last[:, :2], first[:, :2])
+    assert 0.0 < float(torch.stack(steps).max()) <= DRIFT_STEP + 1e-6 and float(last[:, :2].abs().max()) <= limit + 1e-6
 
 
 def test_waist_motors_are_as_strong_as_drawn() -> None:
@@ -306,7 +344,7 @@ def test_frozen_controller_repeats_the_training_policy(tmp_path: Path, monkeypat
     for _ in range(25):
         targets = controller.act(
             environment.world.measure().proprioception,
-            environment.buffers.elevation + 0.75,
+            environment.buffers.maps[:, 0] + 0.75,
             environment.buffers.command,
             environment.buffers.flag,
         )
