@@ -14,57 +14,34 @@ import torch
 import tyro
 
 from evaluation.baselines.onnx_policy import load_controller
-from evaluation.protocols import tracking
 from evaluation.protocols.arena import BATCH, Arena, batch_steps
-from evaluation.protocols.skills import BARS, FLAT, SKILLS, UNLOADED_BEND, run_skills, skill_episodes
 from evaluation.protocols.skills import EPISODES as SKILL_EPISODES
+from evaluation.protocols.skills import FLAT, SKILLS, run_skills, skill_episodes
+from evaluation.protocols.suites import suite_of
 from evaluation.protocols.tracking import (
-    COMPARED,
-    FIGURES,
-    GROUPS,
-    SUITES,
     WALK_EPISODES,
-    CommandTable,
     conditions_of,
     mode_episodes,
     motion_modes,
-    paired_differences,
-    protocol_episodes,
     run_modes,
-    run_tracking,
     run_walking,
-    suite_terrain,
     tracking_figures,
     walking_episodes,
 )
-from evaluation.reporting.plots import plot_bars, plot_curves, plot_heat_map, plot_scatter
 from evaluation.reporting.reports import (
     METRICS_FILE,
     REPORT_FILE,
     check_output,
-    format_figure,
-    markdown_table,
-    metrics,
-    render,
-    write_metrics,
     write_results,
 )
-from evaluation.reporting.statistics import Figure
-from lowlevel.commands import ARMS, CommandSpace
+from evaluation.tracking_report import Evaluation, Measured, summary, write_report
+from lowlevel.commands import CommandSpace
 from lowlevel.control.controller import Controller, add_metrics
 from lowlevel.control.whole_body import Supports, WholeBodyController
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.progress import ProgressReport
-from lowlevel.world.measures import TRACKING_FIGURES
 from lowlevel.world.terrain import TerrainConfig
 from robots.errors import PilotError
-
-_BLIND = dict(zip(TRACKING_FIGURES, (0.145, 0.099, 0.010, 0.057, 0.053, 0.055, 0.206), strict=False))
-EPISODES_FILE = "episodes.csv"
-"""Every command of the protocol with its figures."""
-
-PAPER: dict[str, dict[str, float]] = dict.fromkeys(SUITES, _BLIND)
-"""The paper's figures for each suite: on simple terrain those of its blind policy (Table II)."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +54,8 @@ class Arguments:
     """Controllers to compare with: same seeds, the same commands, which all of them support, and differences episode by
     episode."""
     suite: str = "simple"
-    """Terrain: simple (flat and slabs that differ by ±2 cm, half of the episodes each), flat, or slabs."""
+    """Terrain: simple (flat and slabs that differ by ±2 cm, half of the episodes each), flat, slabs, or full (flat,
+    rough, slopes, stairs and platforms in five levels each, all to be crossed)."""
     condition: str = "nominal"
     """What is other than in the protocol: late-20ms, late-40ms (latency of the targets), slippery (friction 0.4),
     other-gains (every stiffness and damping off by up to 20 %), weak-motors (80 % of the torque limits), weak-waist
@@ -102,40 +80,6 @@ class Arguments:
     """Also store the figures in the controller's own folder."""
 
 
-@dataclass(frozen=True)
-class Measured:
-    """What one controller did."""
-
-    figures: dict[str, Figure]
-    table: CommandTable
-    transient: np.ndarray
-    """Mean errors over the time since a command began (steps, figures)."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Everything a report shows."""
-
-    suite: str
-    condition: str
-    seed: int
-    controller: str
-    """Content hash, or the name on its card."""
-    supports: Supports
-    """What all of the controllers can be told."""
-    ours: Measured
-    others: dict[str, Measured]
-    """What the other controllers did, by hash or name."""
-    modes: tuple[str, ...]
-    activations: np.ndarray
-    """(modes, experts)"""
-    tiles: tuple[str, ...]
-    period: float
-    """[s]"""
-    seconds: float
-    """Time the evaluation took [s]."""
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``evaluate-lowlevel``."""
     parsed = tyro.cli(Arguments, args=arguments)
@@ -151,7 +95,7 @@ def _run(arguments: Arguments) -> None:
         raise PilotError("--skill-episodes must not be negative")
     if not 0 <= arguments.record <= min(arguments.robots, arguments.episodes):
         raise PilotError("--record must be between 0 and the number of episodes and of robots")
-    suite_terrain(arguments.suite)
+    suite_of(arguments.suite)
     conditions_of(arguments.condition)
     if arguments.write_metrics and arguments.condition != "nominal":
         raise PilotError("--write-metrics is for figures under the nominal condition: leave one of the two out")
@@ -189,13 +133,14 @@ def evaluate(
 ) -> Evaluation:
     """Run the protocol, the walking test and the skill tests with all controllers, the motion modes with the first."""
     began = time.monotonic()
-    terrain = suite_terrain(arguments.suite)
+    suite = suite_of(arguments.suite)
     supports = common_supports(controller, others)
-    arena = _arena(controller, terrain, arguments, supports)
+    arena = _arena(controller, suite.terrain, arguments, supports)
     _require_common(supports, arena.space)
-    space, tiles, seed = arena.space, len(terrain.tiles), arguments.seed
-    protocol = protocol_episodes(space, arguments.episodes, seed, tiles)
-    walks = walking_episodes(space, arguments.walk_episodes, seed, tiles)
+    space, seed = arena.space, arguments.seed
+    protocol = suite.episodes(space, arguments.episodes, seed)
+    walk_terrain = FLAT if suite.crosses else suite.terrain
+    walks = walking_episodes(space, arguments.walk_episodes, seed, len(walk_terrain.tiles))
     modes = mode_episodes(space, seed) if arena.experts else []
     skills = {skill.name: skill_episodes(skill, space, arguments.skill_episodes, seed) for skill in SKILLS}
     with ProgressReport() as progress:
@@ -207,11 +152,12 @@ def evaluate(
             progress.update(task, advance=steps)
 
         def measure(tested: WholeBodyController, whose: str) -> Measured:
-            arena = _arena(tested, terrain, arguments, supports)
+            arena = _arena(tested, suite.terrain, arguments, supports)
             progress.update(task, description=f"tracking{whose}")
-            table, transient = run_tracking(arena, protocol, advance)
+            table, transient, figures = suite.run(arena, protocol, advance)
+            figures |= tracking_figures(table, suite.terrain.tiles)
             progress.update(task, description=f"walking{whose}")
-            figures = tracking_figures(table, terrain.tiles) | run_walking(arena, walks, advance)
+            figures |= run_walking(_arena(tested, walk_terrain, arguments, supports), walks, advance)
             if arguments.skill_episodes:
                 progress.update(task, description=f"skills{whose}")
                 figures |= run_skills(_arena(tested, FLAT, arguments, supports), skills, advance)
@@ -222,7 +168,8 @@ def evaluate(
         progress.update(task, description="experts")
         activations = run_modes(arena, modes, advance) if modes else np.zeros((0, 0))
     return Evaluation(
-        suite=arguments.suite,
+        suite=suite,
+        name=arguments.suite,
         condition=arguments.condition,
         seed=seed,
         controller=name,
@@ -231,7 +178,6 @@ def evaluate(
         others=measured,
         modes=tuple(motion_modes(space)) if modes else (),
         activations=activations,
-        tiles=terrain.tiles,
         period=arena.period,
         seconds=time.monotonic() - began,
     )
@@ -260,140 +206,10 @@ def _require_common(supports: Supports, space: CommandSpace) -> None:
 def _record(controller: WholeBodyController, arguments: Arguments, folder: Path, supports: Supports) -> None:
     from evaluation.pictures.recording import record_episodes  # the viewer's library is large and seldom needed here
 
-    terrain = suite_terrain(arguments.suite)
-    arena = _arena(controller, terrain, arguments, supports)
-    episodes = protocol_episodes(arena.space, arguments.record, arguments.seed, len(terrain.tiles))
+    suite = suite_of(arguments.suite)
+    arena = _arena(controller, suite.terrain, arguments, supports)
+    episodes = suite.episodes(arena.space, arguments.record, arguments.seed)
     record_episodes(arena, episodes, folder)
-
-
-# -- report --------------------------------------------------------------------------------------------------
-
-
-def write_report(folder: Path, evaluation: Evaluation) -> None:
-    """Write ``report.md``, plots and ``metrics.json`` into ``folder``."""
-    figures, paper = evaluation.ours.figures, PAPER[evaluation.suite]
-    cases = {"all": "", "steady": "_steady", **{group: f"_{group}" for group in GROUPS}}
-    panels = {name: {label: figures[name + suffix] for label, suffix in cases.items()} for name in TRACKING_FIGURES}
-    panels["fall_rate"] = {label: figures["fall_rate" + suffix] for label, suffix in cases.items() if label != "steady"}
-    evaluation.ours.table.write(folder / EPISODES_FILE, evaluation.tiles)
-    plot_bars(folder / "tracking.png", panels, paper, columns=3)
-    steps = np.arange(1, len(evaluation.ours.transient) + 1) * evaluation.period
-    titles = [f"{name} [{unit}]" for name, (unit, _) in TRACKING_FIGURES.items()]
-    since = "time since the command changed [s]"
-    plot_curves(folder / "transient.png", steps, evaluation.ours.transient, titles, since)
-    if evaluation.modes:
-        experts = [f"expert {number}" for number in range(1, evaluation.activations.shape[1] + 1)]
-        heat = "mean expert activation"
-        plot_heat_map(folder / "experts.png", evaluation.activations, evaluation.modes, experts, heat)
-    if evaluation.others:
-        plot_scatter(folder / "comparison.png", _paired_episodes(evaluation))
-    (folder / REPORT_FILE).write_text(report_text(evaluation))
-    activations = {
-        mode: [None if np.isnan(value) else float(value) for value in row]
-        for mode, row in zip(evaluation.modes, evaluation.activations, strict=True)
-    }
-    write_metrics(
-        folder,
-        metrics(
-            figures,
-            evaluation.seed,
-            evaluation.controller,
-            suite=evaluation.suite,
-            condition=evaluation.condition,
-            expert_activations=activations,
-            others={name: _plain(other.figures) for name, other in evaluation.others.items()},
-            differences={name: _plain(rows) for name, rows in _differences(evaluation).items()},
-            seconds=round(evaluation.seconds, 1),
-        ),
-    )
-
-
-def summary(evaluation: Evaluation) -> str:
-    """The headline figures in one line."""
-    figures = evaluation.ours.figures
-    names = (*TRACKING_FIGURES, "fall_rate")
-    return "  ".join(f"{name} {format_figure(figures[name]).split(' ')[0]}" for name in names)
-
-
-def report_text(evaluation: Evaluation) -> str:
-    """``report.md``."""
-    figures, groups = evaluation.ours.figures, {group: f"_{group}" for group in GROUPS}
-    has_skills = "deep_bend_success" in figures
-    return render(
-        "tracking",
-        **{name: getattr(evaluation, name) for name in ("suite", "condition", "seed", "controller", "tiles", "modes")},
-        protocol=tracking,
-        figures=figures,
-        paper=PAPER[evaluation.suite],
-        comparison=_comparison(evaluation) if evaluation.others else "",
-        told=_told(evaluation.supports),
-        by_group=_breakdown(figures, groups),
-        by_group_steady=_breakdown(figures, groups, "_steady"),
-        by_tile=_breakdown(figures, {tile: f"_on_{tile}" for tile in evaluation.tiles}),
-        skills=[skill for skill in SKILLS if skill is not UNLOADED_BEND] if has_skills else [],
-        bars=BARS,
-    )
-
-
-UNPAIRED = ("fall_rate", "energy_per_meter", "fast_walk_speed", "fast_walk_success", "stop_success", "push_success")
-"""Figures that controllers are compared by, but not episode by episode."""
-
-
-def _differences(evaluation: Evaluation) -> dict[str, dict[str, Figure]]:
-    """Ours minus theirs, by controller and figure."""
-    ours = evaluation.ours.table
-    return {name: paired_differences(ours, other.table) for name, other in evaluation.others.items()}
-
-
-def _paired_episodes(evaluation: Evaluation) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Errors of the same episodes, ours and theirs, by figure and controller."""
-    ours = evaluation.ours.table
-    return {
-        name: {
-            other: (ours.by_episode(name), measured.table.by_episode(name))
-            for other, measured in evaluation.others.items()
-        }
-        for name in FIGURES
-        if name != "E_stumble"
-    }
-
-
-def _comparison(evaluation: Evaluation) -> str:
-    """The table of all controllers."""
-    columns = {"ours": evaluation.ours, **evaluation.others}
-    differences = _differences(evaluation)
-    rows = []
-    for name in dict.fromkeys((*COMPARED, *UNPAIRED)):
-        values = [format_figure(m.figures[name]) if name in m.figures else "–" for m in columns.values()]
-        paired = [format_figure(rows[name]) if name in rows else "–" for rows in differences.values()]
-        rows.append([name, *values, *paired])
-    return markdown_table(["figure", *columns, *(f"ours - {name}" for name in differences)], rows)
-
-
-def _told(supports: Supports) -> str:
-    """The ranges that commands were cut to."""
-    names = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]", "height [m]", "roll [rad]", "pitch [rad]", "yaw [rad]")
-    rows = []
-    for doing, bounds in (("standing", supports.standing), ("walking", supports.walking)):
-        ranges = [
-            f"{low:.2f} to {high:.2f}" for low, high in zip(bounds.lower.tolist(), bounds.upper.tolist(), strict=True)
-        ]
-        arms = "told" if (bounds.upper - bounds.lower)[ARMS].min() > 0.0 else "at their default"
-        rows.append([doing, *ranges[: ARMS.start], arms])
-    return markdown_table(["", *names, "arms"], rows)
-
-
-def _plain(figures: Mapping[str, Figure]) -> dict[str, dict[str, object]]:
-    return {name: asdict(figure) for name, figure in figures.items()}
-
-
-def _breakdown(figures: Mapping[str, Figure], columns: Mapping[str, str], suffix: str = "") -> str:
-    rows = [[name, *(format_figure(figures[name + part + suffix]) for part in columns.values())] for name in FIGURES]
-    if not suffix:
-        rates = ("fall_rate", "fall_rate_command")
-        rows += [[name, *(format_figure(figures[name + part]) for part in columns.values())] for name in rates]
-    counts = ["episodes", *(str(figures[f"fall_rate{part}"].n) for part in columns.values())]
-    return markdown_table(["figure", *(label.replace("_", " ") for label in columns)], [*rows, counts])
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lowlevel.commands import COMMAND_SIZE, clamp_posture, command_space
+from lowlevel.commands import COMMAND_SIZE, VELOCITY, clamp_posture, command_space
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import MAP_REFRESH_STEPS, NoiseConfig
 from lowlevel.control.whole_body import HasExperts, Supports, WholeBodyController
@@ -30,6 +30,10 @@ BATCH = 32
 """Robots side by side. The last digits of a matrix product, and with them a fall, depend on its row count."""
 START_SPREAD = 1.0
 """Largest distance of a start from its tile's center, per axis [m]."""
+COURSE_SPREAD = 0.5
+"""Largest distance of a start to the left or right of a course [m]."""
+STEERING, MOST_STEERING = 1.0, 0.5
+"""Yaw rate told per radian off a course [1/s], and the largest one [rad/s]."""
 JOINT_SPREAD = 0.02
 """Largest deviation of a joint from the standing pose at the start [rad]."""
 _PROPRIOCEPTION_SIZE = 2 * NUM_JOINTS + 6
@@ -58,6 +62,14 @@ class HandLoad:
 
 
 @dataclass(frozen=True)
+class Course:
+    """A straight way along the x axis of the world, kept by somebody who steers."""
+
+    start: tuple[float, float]
+    """From the center of the tile [m]; the robot starts there up to COURSE_SPREAD beside it, facing along its way."""
+
+
+@dataclass(frozen=True)
 class Episode:
     """What happens to one robot: it starts standing at rest and is given piecewise constant commands."""
 
@@ -77,6 +89,8 @@ class Episode:
     load: HandLoad | None = None
     stands_up: bool = True
     """Whether a robot that has fallen is stood up for its next command."""
+    course: Course | None = None
+    """How it crosses its tile; without one it starts near the middle of it, facing anywhere, and is not steered."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +207,7 @@ class Arena:
         starts, commands, flags = self._schedules(episodes)
         pushes = self._pushes(episodes)
         load_begin, outward, downward = self._loads(episodes)
+        steered = torch.tensor([episode.course is not None for episode in episodes])
         frame_noise, map_noise, starting = self._start(episodes)
         self.controller.reset(self.batch)
         up = torch.ones(self.batch, dtype=torch.bool)
@@ -211,6 +226,7 @@ class Arena:
             if not (active | waiting).any():
                 return
             command, flag = commands[rows, current], flags[rows, current]
+            command = self._steered(command, measured, steered)
             seeing = rows if step % MAP_REFRESH_STEPS == 0 else rising
             if len(seeing):
                 noisy = self.world.elevation(measured) + map_noise[step // MAP_REFRESH_STEPS]
@@ -245,6 +261,15 @@ class Arena:
                 failed=failed,
             )
             up = up & ~fell & ~failed
+
+    def _steered(self, command: Tensor, measured: Measurement, steered: Tensor) -> Tensor:
+        """``command`` (N, 21), in which the first rows that are ``steered`` are told to turn back to their course."""
+        (ids,) = torch.nonzero(steered, as_tuple=True)
+        if len(ids):
+            off = torch.atan2(torch.sin(measured.heading[ids]), torch.cos(measured.heading[ids]))
+            command[ids, VELOCITY.stop - 1] = (-STEERING * off).clamp(-MOST_STEERING, MOST_STEERING)
+            command[ids] = self.supports.cut(command[ids])
+        return command
 
     def _gate(self) -> Tensor:
         return self.controller.gate if isinstance(self.controller, HasExperts) else torch.zeros(self.batch, 0)
@@ -299,14 +324,15 @@ class Arena:
         refreshes = -(-steps // MAP_REFRESH_STEPS)
         frame_noise = torch.zeros(steps, self.batch, _PROPRIOCEPTION_SIZE)
         map_noise = torch.zeros(refreshes, self.batch, MAP_SIZE)
-        place, joint_spread = torch.zeros(self.batch, 3), torch.zeros(self.batch, NUM_JOINTS)
+        offset, heading = torch.zeros(self.batch, 2), torch.zeros(self.batch)
+        joint_spread = torch.zeros(self.batch, NUM_JOINTS)
         tiles = torch.zeros(self.batch, dtype=torch.long)
         for row, episode in enumerate(episodes):
             # Apart from each other, so that conditions that draw more leave place and noise as they are.
             self._randomizer.generator = torch.Generator().manual_seed(episode.seed)
             self._randomizer.draw(torch.tensor([row]))
             generator = torch.Generator().manual_seed(episode.seed + 1)
-            place[row] = _symmetric(generator, 3)
+            place = _symmetric(generator, 3)
             joint_spread[row] = JOINT_SPREAD * _symmetric(generator, NUM_JOINTS)
             # Drawn step by step, so that the noise does not depend on how long the episode lasts.
             for refresh in range(refreshes):
@@ -315,11 +341,11 @@ class Arena:
                 frame_noise[when, row] = self._proprioception_noise * noise[: when.stop - when.start]
                 map_noise[refresh, row] = self._elevation_noise * _symmetric(generator, MAP_SIZE)
             tiles[row] = episode.tile
-        starting = (
-            self.world.terrain.tile_centers[tiles] + START_SPREAD * place[:, :2],
-            torch.pi * place[:, 2],
-            joint_spread,
-        )
+            offset[row], heading[row] = START_SPREAD * place[:2], torch.pi * place[2]
+            if episode.course is not None:
+                offset[row] = torch.tensor(episode.course.start) + COURSE_SPREAD * torch.tensor([0.0, 1.0]) * place[1]
+                heading[row] = 0.0
+        starting = (self.world.terrain.tile_centers[tiles] + offset, heading, joint_spread)
         self._stand(torch.arange(self.batch), *starting)
         return frame_noise, map_noise, starting
 

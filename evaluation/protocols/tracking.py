@@ -35,7 +35,6 @@ from lowlevel.commands import (
 )
 from lowlevel.world.measures import TRACKING_FIGURES, velocity_error
 from lowlevel.world.randomization import RandomizationConfig
-from lowlevel.world.terrain import TerrainConfig
 from robots.errors import PilotError
 
 EPISODE_LENGTH = 20.0
@@ -49,13 +48,6 @@ TILE_SIZE = 16.0
 
 AVERAGING = 0.5
 """Time over which velocities are averaged for the errors that leave out the sway of a gait [s]."""
-
-SUITES: dict[str, tuple[str, ...]] = {
-    "simple": ("flat", "irregular"),
-    "flat": ("flat",),
-    "slabs": ("irregular",),
-}
-"""Terrain tiles of each suite, in equal shares."""
 
 _AS_IT_IS = RandomizationConfig.for_evaluation()
 CONDITIONS: dict[str, RandomizationConfig] = {
@@ -81,17 +73,6 @@ MODE_EPISODES = 5
 """Episodes of each motion mode."""
 MODE_TIME = 6.0
 """Length of a motion-mode episode [s]."""
-
-
-def suite_terrain(suite: str) -> TerrainConfig:
-    """The terrain of a suite.
-
-    Raises:
-        PilotError: if there is no such suite.
-    """
-    if suite not in SUITES:
-        raise PilotError(f"unknown suite {suite!r}; choose one of {', '.join(SUITES)}")
-    return TerrainConfig(tiles=SUITES[suite], tile_size=TILE_SIZE)
 
 
 def conditions_of(name: str) -> RandomizationConfig:
@@ -162,6 +143,7 @@ class CommandTable:
 
     episode: np.ndarray
     tile: np.ndarray
+    """Index into the terrain's kinds of tile."""
     group: np.ndarray
     """Index into GROUPS."""
     columns: dict[str, np.ndarray]
@@ -197,12 +179,16 @@ def run_tracking(
     Returns:
         the table of their commands, and the mean figures over the time since a command began (steps, figures).
     """
-    trace = record(arena, episodes, CHANNELS, advance)
-    starts = [round(start / arena.period) for start in episodes[0].starts]
+    return tabulate(record(arena, episodes, CHANNELS, advance), episodes, len(arena.world.terrain.config.levels))
+
+
+def tabulate(trace: Trace, episodes: Sequence[Episode], levels: int) -> tuple[CommandTable, np.ndarray]:
+    """What :func:`run_tracking` returns, from a ``trace`` with its channels; tiles come in as many ``levels``."""
+    starts = [round(start / trace.period) for start in episodes[0].starts]
     ends = [*starts[1:], trace.fell.shape[1]]
     spans = [slice(start, end) for start, end in zip(starts, ends, strict=True)]
     parts = [command_columns(trace, span) for span in spans]
-    tiles = np.array([episode.tile for episode in episodes])
+    tiles = np.array([episode.tile // levels for episode in episodes])
     # An episode's commands follow one another.
     columns = {name: np.stack([part[name] for part in parts], axis=1).reshape(-1) for name in parts[0]}
     count = len(spans)

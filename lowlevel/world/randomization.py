@@ -61,8 +61,8 @@ class RandomizationConfig:
     map_drift: float = 0.05
     """Largest horizontal error of the maps, per axis [m]: that of the estimated position, which wanders."""
     map_delay: tuple[float, float, float] = (0.4, 0.4, 0.2)
-    """Chances that a robot's maps are 0, 100 and 200 ms old when they arrive (InternRobotics/Gallant has a LiDAR's at 120
-    to 280 ms)."""
+    """Chances that a robot's maps are 0, 100 and 200 ms old when they arrive: those of a LiDAR are 120 to 280 ms old in
+    InternRobotics/Gallant."""
 
     @classmethod
     def for_evaluation(cls) -> RandomizationConfig:

@@ -2,7 +2,7 @@
 
 Every robot of a batch lives in the same world, so the whole terrain is part of one shared model. A tile is a
 square patch made by one function of :data:`TILES`. To add one, add a function there, and name it in the
-terrain of a stage (:mod:`lowlevel.presets`) and in ``evaluation.protocols.tracking.SUITES``.
+terrain of a stage (:mod:`lowlevel.presets`) and in ``evaluation.protocols.suites.SUITES``.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from robots.rotations import rotate_about_vertical
 
 MARGIN = 0.5
 """Flat ground around what stands on a tile [m]."""
+LANDING = 2.0
+"""Side of the flat top of slopes and stairs [m]."""
 STANCE_REACH = 0.3
 """No part of a standing robot's soles is farther than this from the base, horizontally and along each axis [m]."""
 
@@ -72,38 +74,58 @@ def irregular(size: float, level: float, rng: np.random.Generator) -> list[Block
     ]
 
 
+def roughness(level: float) -> float:
+    """Largest height above and below the middle of rough ground [m]."""
+    return 0.06 * level
+
+
+def slope_angle(level: float) -> float:
+    """2 to 20 degrees [rad]."""
+    return math.radians(2.0 + 18.0 * level)
+
+
+def riser_height(level: float) -> float:
+    """Of stairs, 5 to 20 cm [m]."""
+    return 0.05 + 0.15 * level
+
+
+def platform_height(level: float) -> float:
+    """10 to 30 cm [m]."""
+    return 0.1 + 0.2 * level
+
+
 def rough(size: float, level: float, rng: np.random.Generator) -> list[Block]:
-    """Steps of 0 to 12 cm at level 1 every 0.4 m, both ways: within +-6 cm of the middle.
+    """Steps every 0.4 m, both ways, of up to twice the :func:`roughness`.
 
     The ground is the higher one of two crossing strips: a tenth of the blocks that as many slabs would take.
     """
     half, strip = size / 2.0, 0.4
     count = round(size / strip)
     centers = (np.arange(count) + 0.5) * strip - half
-    tops = 0.002 + 0.12 * level * rng.random((2, count))
+    tops = 0.002 + 2.0 * roughness(level) * rng.random((2, count))
     along = [Block((float(x), 0.0), (strip / 2, half), float(top)) for x, top in zip(centers, tops[0], strict=True)]
     across = [Block((0.0, float(y)), (half, strip / 2), float(top)) for y, top in zip(centers, tops[1], strict=True)]
     return along + across
 
 
 def slope(size: float, level: float, rng: np.random.Generator) -> list[Block]:
-    """Slopes of 2 degrees at level 0 to 20 degrees at level 1, up to a landing of 2 m in the middle."""
-    base, landing = size / 2.0 - MARGIN, 1.0
-    height = (base - landing) * math.tan(math.radians(2.0 + 18.0 * level))
+    """Slopes up to a landing of 2 m in the middle."""
+    base, landing = size / 2.0 - MARGIN, 0.5 * LANDING
+    height = (base - landing) * math.tan(slope_angle(level))
     return [Block((0.0, 0.0), (base, base), height, (landing, landing))]
 
 
 def stairs(size: float, level: float, rng: np.random.Generator) -> list[Block]:
-    """Stairs up to a landing of 2 m in the middle: risers of 5 to 20 cm, by their level, and treads of 25 to 35 cm."""
-    riser, tread, landing = 0.05 + 0.15 * level, float(rng.choice([0.25, 0.3, 0.35])), 1.0
+    """Stairs up to a landing of 2 m in the middle, with treads of 25 to 35 cm."""
+    riser, tread, landing = riser_height(level), float(rng.choice([0.25, 0.3, 0.35])), 0.5 * LANDING
     count = int((size / 2.0 - MARGIN - landing) / tread)
     return [Block((0.0, 0.0), (landing + (count - step) * tread,) * 2, (step + 1) * riser) for step in range(count + 1)]
 
 
 def platform(size: float, level: float, rng: np.random.Generator) -> list[Block]:
-    """Blocks of 0.5 m across the tile, to step onto and off: 10 cm high at level 0, 30 cm at level 1."""
+    """Blocks of 0.5 m across the tile, to step onto and off."""
     length = size / 2.0 - MARGIN
-    return [Block((x, 0.0), (0.25, length), 0.1 + 0.2 * level) for x in (-2.0, 0.0, 2.0)]
+    return [Block((x, 0.0), (0.25, length), platform_height(level)) for x in (-2.0, 0.0, 2.0)]
 
 
 TileFunction = Callable[[float, float, np.random.Generator], list[Block]]

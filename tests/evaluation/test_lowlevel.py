@@ -17,6 +17,7 @@ import torch
 from evaluation.lowlevel import main
 from evaluation.protocols.arena import Arena, Episode, Push
 from evaluation.protocols.skills import BARS
+from evaluation.protocols.suites import suite_of
 from evaluation.protocols.tracking import (
     FIGURES,
     GROUPS,
@@ -29,7 +30,6 @@ from evaluation.protocols.tracking import (
     run_modes,
     run_tracking,
     run_walking,
-    suite_terrain,
     tracking_figures,
     walking_episodes,
 )
@@ -221,9 +221,9 @@ def test_activations_are_averaged_by_mode(arena: Arena, controller: Controller) 
 
 
 def test_suites() -> None:
-    assert suite_terrain("simple").tiles == ("flat", "irregular")
-    with pytest.raises(ValueError, match="unknown suite 'hard'; choose one of simple, flat, slabs"):
-        suite_terrain("hard")
+    assert suite_of("simple").terrain.tiles == ("flat", "irregular")
+    with pytest.raises(ValueError, match="unknown suite 'hard'; choose one of simple, flat, slabs, full"):
+        suite_of("hard")
 
 
 # -- the command ---------------------------------------------------------------------------------------------
