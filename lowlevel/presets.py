@@ -49,7 +49,9 @@ SHAPED = replace(
 STEPPING = replace(TRACKING, foot_phase=2.0, foot_placement=2.0, contact_schedule=1.0, swing_height=2.0)
 """While it improves its steps: shaping that has done its work makes a fall cost more, and speed cost falls."""
 
-EXACT = replace(STEPPING, alive=-10.0, angular_velocity=8.0, mean_linear_velocity=20.0, mean_angular_velocity=10.0)
+EXACT = replace(
+    STEPPING, energy=-0.01, alive=-10.0, angular_velocity=8.0, mean_linear_velocity=20.0, mean_angular_velocity=10.0
+)
 """For a robot that seldom falls. A fall forfeits some two seconds of reward; with 10 per second less of it errors count
 for more."""
 
@@ -189,7 +191,8 @@ STAGES = (
         waits_for="curriculum/hardness",
         above=0.98,
         most_steps=40_000_000,
-        std=(0.05, 0.1),
+        std=(0.3, 0.4),
+        noise_at_rest=0.25,
         mixture=EVERYTHING,
         rewards=EXACT,
         randomization=replace(GENTLE, hand_load_probability=0.4),

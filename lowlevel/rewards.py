@@ -171,7 +171,7 @@ def no_fly(t: Transition) -> Tensor:
     return (t.measured.foot_contact.sum(-1) == torch.where(t.walking, 1, 2)).float()
 
 
-SWING_HEIGHT = 0.12
+SWING_HEIGHT = 0.08
 """Height of the sole at mid-swing [m]. With 7 cm two of three falls on slabs follow a foot that ran into an edge."""
 STANCE_WIDTH = 0.18
 """Distance of the feet across the heading [m]; that of the hips is 0.24, but the pelvis sways with it."""

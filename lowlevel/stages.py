@@ -31,6 +31,9 @@ class Stage:
     """Environment steps after which the next stage begins all the same."""
     std: tuple[float, float] = (0.05, 0.3)
     """Bounds of the exploration noise [action units]."""
+    noise_at_rest: float = 1.0
+    """Noise of a robot whose gait clock rests, as a share of that of one that walks. Noise at which a robot learns to
+    walk fells one that bends deeply, and it learns to bend less."""
     gait_frequency: float = 2.0
     """Steps of one foot per second [Hz]."""
     prior: GaitPriorConfig | None = None

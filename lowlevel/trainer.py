@@ -134,7 +134,9 @@ class Trainer:
         self.environment = PilotEnvironment(stage.environment(self.config.environment), seed=seed, device="cpu")
         self._shares, self._tile_shares = shares(stage.mixture), tile_shares(stage.terrain)
         acting = NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop
-        self.ppo.enter(stage.std, acting, stage.rollout_doublings, stage.gait_noise, stage.normalizes_by_kind)
+        self.ppo.enter(
+            stage.std, acting, stage.rollout_doublings, stage.gait_noise, stage.normalizes_by_kind, stage.noise_at_rest
+        )
         self._apply_curriculum()
         self.observation = {}
 

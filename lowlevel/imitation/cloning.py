@@ -95,7 +95,7 @@ def clone(
     ``report`` is told how it goes, every ten rounds. Returns the observation to go on from.
     """
     student, device = ppo.actor, ppo.device
-    acting, std = ppo.learner.acting, student.log_std.exp().detach()
+    acting = ppo.learner.acting
     optimizer = torch.optim.Adam(student.policy_parameters(), lr=config.learning_rate)
     kept: deque[tuple[Tensor, ...]] = deque(maxlen=config.kept_rounds)
     observation = environment.reset(spread_episodes=True)
@@ -111,9 +111,10 @@ def clone(
             with torch.no_grad():
                 own = student(seen["history"], *context)
             teachers_turn = torch.rand(len(label), 1, generator=ppo.generator, device=device) < handing_over
+            frame = seen["history"][:, -FRAME_SIZE:].clone()
+            std = ppo.learner.std(frame).detach()
             noise = 0.5 * std * torch.randn(label.shape, generator=ppo.generator, device=device)
             action = torch.where(teachers_turn, label, own.mean) + noise
-            frame = seen["history"][:, -FRAME_SIZE:].clone()
             samples.append((frame, *(c.clone() for c in context), own.motion, own.latent, label))
             samples.append(_mirrored(ppo, seen, label))
             result = environment.step(action.cpu())
@@ -125,7 +126,9 @@ def clone(
         losses = []
         for _ in range(config.gradient_steps):
             index = torch.randint(len(labels), (config.minibatch,), generator=ppo.generator, device=device)
-            mean, _ = student.decide(*(column[index] for column in inputs))
+            chosen = [column[index] for column in inputs]
+            mean, _ = student.decide(*chosen)
+            std = ppo.learner.std(chosen[0]).detach()
             loss = 0.5 * ((mean - labels[index]) / std)[:, acting].square().sum(dim=1).mean()
             optimizer.zero_grad()
             loss.backward()

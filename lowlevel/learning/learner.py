@@ -120,6 +120,7 @@ class Learner:
         device: torch.device,
         command_columns: Tensor,
         privileged_command_columns: Tensor | None,
+        gait_clock: slice | None = None,
     ) -> None:
         """Build networks, equal on all ranks, and optimizers; arguments as in :class:`lowlevel.learning.ppo.PPO`."""
         self.config = config
@@ -132,6 +133,9 @@ class Learner:
         """The actions that take part: the others are neither explored nor learned."""
         self.std_bounds = (1e-6, math.inf)
         """Range of the exploration noise [action units]."""
+        self.gait_clock = gait_clock
+        self.noise_at_rest = 1.0
+        """Noise of a robot whose gait clock rests, as a share of that of one that walks."""
         self._modules = {"actor": self.actor, "critic": self.critic, "target_encoder": self.target_encoder}
         for module in self._modules.values():
             broadcast([*module.parameters(), *module.buffers()])
@@ -155,13 +159,25 @@ class Learner:
         """Evaluate the actor on raw observations."""
         return self.actor(*(observation[key] for key in ACTOR_KEYS))
 
-    def distribution(self, mean: Tensor) -> Normal:
-        """The exploration noise around ``mean`` (N, A)."""
-        return Normal(mean, self.actor.log_std.exp().expand_as(mean), validate_args=False)
+    def std(self, frame: Tensor, std: Tensor | None = None) -> Tensor:
+        """Standard deviation (N, A) of the exploration noise [action units] at ``frame`` (N, F).
 
-    def log_prob(self, mean: Tensor, action: Tensor) -> Tensor:
-        """Log-probability (N,) of ``action`` (N, A) under the noise around ``mean`` (N, A)."""
-        return self.distribution(mean).log_prob(action)[:, self.acting].sum(dim=1)
+        ``std`` (A,) is that of a robot that walks, by default what it has become. One that stands deep and bent falls
+        under noise that does one good that walks, and would learn to bend less.
+        """
+        std = self.actor.log_std.exp() if std is None else std
+        if self.gait_clock is None:
+            return std.expand(len(frame), -1)
+        walks = frame[:, self.gait_clock].square().sum(dim=1, keepdim=True)
+        return std * torch.lerp(torch.full_like(walks, self.noise_at_rest), torch.ones_like(walks), walks)
+
+    def distribution(self, mean: Tensor, frame: Tensor) -> Normal:
+        """The exploration noise around ``mean`` (N, A) at ``frame`` (N, F)."""
+        return Normal(mean, self.std(frame), validate_args=False)
+
+    def log_prob(self, mean: Tensor, action: Tensor, frame: Tensor) -> Tensor:
+        """Log-probability (N,) of ``action`` (N, A) under the noise around ``mean`` (N, A) at ``frame`` (N, F)."""
+        return self.distribution(mean, frame).log_prob(action)[:, self.acting].sum(dim=1)
 
     def losses(
         self, samples: Mapping[str, Tensor], images: Mapping[str, Tensor] | None, old_std: Tensor, estimating: bool
@@ -169,7 +185,7 @@ class Learner:
         """Losses "actor", "critic" and, if ``estimating``, "estimator", with figures to log; all scalars.
 
         ``samples``: B rows per name. ``images``: mirror images of the last rows, for the symmetry loss.
-        ``old_std`` (A,) is the noise of the policy that acted.
+        ``old_std`` (A,) is the noise of the policy that acted, of robots that walk.
         """
         losses = self._actor_losses(samples, images, old_std)
         losses["critic"] = (self.critic(samples["privileged"]) - samples["returns"]).square().mean()
@@ -180,21 +196,22 @@ class Learner:
     ) -> dict[str, Tensor]:
         config = self.config
         mean, gate = self.actor.decide(*(samples[key] for key in POLICY_KEYS))
-        distribution = self.distribution(mean)
+        frame = samples["frame"]
+        distribution = self.distribution(mean, frame)
         log_prob = distribution.log_prob(samples["action"])[:, self.acting].sum(dim=1)
         surrogate = clipped_surrogate(log_prob, samples["log_prob"], samples["advantage"], config.clip).mean()
-        entropy = distribution.entropy()[0, self.acting].sum()
+        entropy = distribution.entropy()[:, self.acting].sum(dim=1).mean()
         figures = {"surrogate": surrogate, "entropy": entropy}
         loss = surrogate - config.entropy_weight * entropy
         if images is not None:
             image, _ = self.actor.decide(*(images[key] for key in POLICY_KEYS))
             difference = image - self.mirrors("action", mean[-len(image) :])
-            deviations = difference / self.actor.log_std.exp().detach()
+            deviations = difference / self.std(images["frame"]).detach()
             figures["asymmetry"] = 0.5 * deviations[:, self.acting].square().sum(dim=1).mean()
             loss = loss + config.mirror_loss_weight * figures["asymmetry"]
         with torch.no_grad():
-            old = Normal(samples["mean"], old_std, validate_args=False)
-            figures["kl"] = kl_divergence(old, self.distribution(mean))[:, self.acting].sum(dim=1).mean()
+            old = Normal(samples["mean"], self.std(frame, old_std), validate_args=False)
+            figures["kl"] = kl_divergence(old, distribution)[:, self.acting].sum(dim=1).mean()
             ratio = torch.exp(log_prob - samples["log_prob"])
             figures["clip_fraction"] = ((ratio - 1.0).abs() > config.clip).float().mean()
             figures["gate_entropy"] = torch.special.entr(gate).sum(dim=1).mean()

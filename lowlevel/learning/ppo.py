@@ -80,6 +80,7 @@ class PPO:
             self.device,
             command_columns,
             privileged_command_columns,
+            gait_clock,
         )
         self.actor = self.learner.actor
         self.critic = self.learner.critic
@@ -124,7 +125,8 @@ class PPO:
         """
         observation = {key: observation[key].to(self.device) for key in OBSERVATION_KEYS}
         output = self.learner.policy(observation)
-        action = output.mean + self.actor.log_std.exp() * self._noise(observation["history"])
+        frame = observation["history"][:, -self.sizes.frame :]
+        action = output.mean + self.learner.std(frame) * self._noise(frame)
         if not bool(torch.isfinite(action).all()):
             for key, values in observation.items():
                 require_finite(f"observation {key!r} at rollout step {self.storage.position}", values)
@@ -133,12 +135,12 @@ class PPO:
         acted = {
             "action": action,
             "mean": output.mean,
-            "log_prob": self.learner.log_prob(output.mean, action),
+            "log_prob": self.learner.log_prob(output.mean, action, frame),
         }
         self.storage.write({**observation, **estimates, **acted})
         return action
 
-    def _noise(self, history: Tensor) -> Tensor:
+    def _noise(self, frame: Tensor) -> Tensor:
         """Exploration noise of unit variance (N, A), a share of which is a pattern over the gait clock.
 
         White noise at 50 Hz hardly changes how a robot walks, and what it does change drowns in what falls do to the
@@ -146,7 +148,7 @@ class PPO:
         that is a better one. As in gSDE (Raffin et al., arXiv 2005.05719) the probability of an action stays that of
         its marginal distribution.
         """
-        share, shape = self.gait_noise_share, (len(history), self.sizes.action)
+        share, shape = self.gait_noise_share, (len(frame), self.sizes.action)
 
         def normal(*size: int) -> Tensor:
             return torch.randn(*size, generator=self.generator, device=self.device)
@@ -157,7 +159,7 @@ class PPO:
         renewed = chance * self.config.gait_noise_steps < 1.0
         fresh = torch.where(self._gait_noise.any(), renewed, True)[:, None, None]
         self._gait_noise = torch.where(fresh, normal(*shape, 3), self._gait_noise)
-        clock = history[:, -self.sizes.frame :][:, self.gait_clock]
+        clock = frame[:, self.gait_clock]
         # Sine and cosine share the variance with the constant; at a stand, where the clock is zero, it has all of it.
         walking = clock.square().sum(dim=1, keepdim=True)
         parts = torch.cat([torch.sqrt(1.0 - 0.5 * walking), clock * 0.5**0.5], dim=1)
@@ -171,9 +173,11 @@ class PPO:
         rollout_doublings: int = 0,
         gait_noise_share: float = 0.0,
         normalizes_by_task: bool = False,
+        noise_at_rest: float = 1.0,
     ) -> None:
         """Go on with exploration noise between the bounds ``std``, in the first ``acting`` actions only.
 
+        ``noise_at_rest``: noise of robots whose gait clock rests, as a share of that of those that walk.
         Rollouts are 2 to the power of ``rollout_doublings`` times as long as at first. ``gait_noise_share``: share of
         the noise's variance that repeats with the gait. ``normalizes_by_task``: whether advantages are normalized
         within each task.
@@ -187,7 +191,7 @@ class PPO:
         if steps != self.storage.steps:
             self.storage = self._room_for(steps, self.storage.num_envs)
         self.learner.acting = slice(0, acting)
-        self.learner.std_bounds = std
+        self.learner.std_bounds, self.learner.noise_at_rest = std, noise_at_rest
         self.gait_noise_share, self.normalizes_by_task = gait_noise_share, normalizes_by_task
         self.learner.limit_noise()
 
@@ -305,7 +309,8 @@ class PPO:
             rows("mean")[part].copy_(output.mean)
             rows("motion")[part].copy_(output.motion)
             rows("latent")[part].copy_(output.latent)
-            rows("log_prob")[part].copy_(self.learner.log_prob(output.mean, rows("action")[part]))
+            frame = rows("history")[part][:, -self.sizes.frame :]
+            rows("log_prob")[part].copy_(self.learner.log_prob(output.mean, rows("action")[part], frame))
 
     def _draw_minibatches(self) -> list[Tensor]:
         """Indices of the samples of every gradient step: one shuffled pass over the rollout per epoch."""
@@ -346,7 +351,7 @@ class PPO:
         recorded["frame"] = recorded["history"][:, -self.sizes.frame :]
         before, _ = self.actor.decide(*(recorded[key] for key in POLICY_KEYS))
         after = self.learner.policy(recorded).mean
-        divergence = kl_divergence(self.learner.distribution(before), self.learner.distribution(after))
+        divergence = kl_divergence(*(self.learner.distribution(mean, recorded["frame"]) for mean in (before, after)))
         return float(divergence[:, self.learner.acting].sum(dim=1).mean())
 
     def state_dict(self) -> dict[str, Any]:

@@ -234,6 +234,30 @@ def test_gait_noise_has_unit_variance_and_repeats_with_the_clock() -> None:
     assert torch.corrcoef(torch.stack([noise(0.4)[:, 0], first[:, 0]]))[0, 1] == pytest.approx(0.5**0.5, abs=0.05)
 
 
+def test_a_robot_at_rest_has_a_share_of_the_noise_and_its_probability_knows() -> None:
+    robots = 4096
+    ppo = make_ppo(robots, initial_std=0.4, steps_per_update=1, minibatches=1, mirror_loss_weight=0.0)
+    ppo.learner.gait_clock = slice(0, 2)
+    ppo.enter((0.4, 0.4), acting=4, noise_at_rest=0.25)
+    observed = observation(torch.Generator().manual_seed(0), robots)
+    clock = observed["history"][:, -SIZES.frame :][:, :2]
+    angle = torch.linspace(0.0, 6.0, robots)
+    clock[:] = torch.stack([angle.sin(), angle.cos()], dim=1)
+    rests = torch.arange(robots) % 2 == 0
+    clock[rests] = 0.0
+    noise = ppo.act(observed) - ppo.deterministic(observed)
+    for which, std in ((rests, 0.1), (~rests, 0.4)):
+        torch.testing.assert_close(noise[which].std(dim=0), torch.full((4,), std), rtol=0.06, atol=0.0)
+        by_hand = (-0.5 * (noise[which] / std) ** 2 - math.log(std) - 0.5 * math.log(2.0 * math.pi)).sum(dim=1)
+        torch.testing.assert_close(ppo.storage.data["log_prob"][0][which], by_hand, rtol=1e-3, atol=1e-3)
+    never = torch.zeros(robots, dtype=torch.bool)
+    ppo.record(torch.ones(robots), never, never, observed["privileged"])
+    losses = ppo.learner.losses(
+        ppo._samples(torch.arange(robots), estimating=False), None, torch.full((4,), 0.4), estimating=False
+    )
+    assert float(losses["kl"]) == pytest.approx(0.0, abs=1e-6) and float(losses["clip_fraction"]) == 0.0
+
+
 @pytest.mark.parametrize("by_task", [False, True])
 def test_advantages_are_normalized_as_the_stage_has_it(by_task: bool) -> None:
     ppo = make_ppo(robots=64, steps_per_update=1, minibatches=1)

@@ -35,7 +35,9 @@ def _fill(ppo: PPO, robots: slice, seed: int) -> dict[str, torch.Tensor]:
                 "mean": output.mean,
                 "motion": output.motion,
                 "latent": output.latent,
-                "log_prob": ppo.learner.log_prob(output.mean, action[robots]).detach(),
+                "log_prob": ppo.learner.log_prob(
+                    output.mean, action[robots], mine["history"][:, -SIZES.frame :]
+                ).detach(),
             }
         )
         ppo.record(reward[robots], ended[robots], torch.zeros(width, dtype=torch.bool), final[robots])
