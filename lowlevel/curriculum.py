@@ -32,7 +32,7 @@ class CurriculumConfig:
     """Opening of every kind at the start; not zero, so that no input is constant."""
     growth: float = 0.006
     """Growth of an opening per update."""
-    quality: float = 0.45
+    quality: float = 0.35
     """Quality of tracking above which a kind may grow, under the noise of exploration."""
     steps_between_falls: float = 300.0
     """Control steps of a kind per fall above which it may grow; below half as many it shrinks. Where every robot falls

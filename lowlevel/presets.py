@@ -46,12 +46,10 @@ SHAPED = replace(
 )
 """While the robot learns what a step is."""
 
-STEPPING = replace(TRACKING, foot_phase=2.0, foot_placement=2.0, contact_schedule=1.0, swing_height=2.0)
+STEPPING = replace(TRACKING, energy=-0.01, foot_phase=2.0, foot_placement=2.0, contact_schedule=1.0, swing_height=2.0)
 """While it improves its steps: shaping that has done its work makes a fall cost more, and speed cost falls."""
 
-EXACT = replace(
-    STEPPING, energy=-0.01, alive=-10.0, angular_velocity=8.0, mean_linear_velocity=20.0, mean_angular_velocity=10.0
-)
+EXACT = replace(STEPPING, alive=-10.0, angular_velocity=8.0, mean_linear_velocity=20.0, mean_angular_velocity=10.0)
 """For a robot that seldom falls. A fall forfeits some two seconds of reward; with 10 per second less of it errors count
 for more."""
 
@@ -117,7 +115,7 @@ STAGES = (
         gait_noise=0.0,
         normalizes_by_kind=False,
         gait_frequency=SLOW_STEPS,
-        std=(0.05, 0.3),
+        std=(0.2, 0.3),
         prior=GaitPriorConfig(),
         mixture=(("forward", 0.5), ("steer", 0.3), ("stand", 0.1), ("squat", 0.1)),
         rewards=SHAPED,
@@ -126,10 +124,10 @@ STAGES = (
     Stage(
         "stride",
         waits_for="curriculum/quality/forward",
-        above=0.62,
-        most_steps=5_000_000,
+        above=0.55,
+        most_steps=4_000_000,
         gait_frequency=SLOW_STEPS,
-        std=(0.05, 0.15),
+        std=(0.2, 0.3),
         mixture=(("forward", 0.6), ("steer", 0.15), ("stand", 0.25)),
         rewards=STEPPING,
         randomization=GENTLE,
@@ -137,9 +135,9 @@ STAGES = (
     Stage(
         "steer",
         waits_for="curriculum/quality/steer",
-        above=0.62,
-        most_steps=8_000_000,
-        std=(0.05, 0.15),
+        above=0.55,
+        most_steps=6_000_000,
+        std=(0.2, 0.3),
         mixture=(("forward", 0.25), ("steer", 0.45), ("slow", 0.1), ("stand", 0.2)),
         rewards=STEPPING,
         randomization=GENTLE,
@@ -149,7 +147,8 @@ STAGES = (
         waits_for="curriculum/opening/squat",
         above=0.98,
         most_steps=8_000_000,
-        std=(0.05, 0.1),
+        std=(0.2, 0.3),
+        noise_at_rest=0.4,
         mixture=(("steer", 0.4), ("slow", 0.1), ("stand", 0.1), ("squat", 0.4)),
         rewards=STEPPING,
         randomization=GENTLE,
@@ -159,7 +158,8 @@ STAGES = (
         waits_for="curriculum/opening/stand_and_work",
         above=0.98,
         most_steps=15_000_000,
-        std=(0.05, 0.1),
+        std=(0.2, 0.3),
+        noise_at_rest=0.4,
         prior=ANSWERS,
         mixture=(("steer", 0.3), ("slow", 0.1), ("stand", 0.1), ("stand_and_work", 0.5)),
         rewards=STEPPING,
@@ -170,8 +170,9 @@ STAGES = (
         waits_for="curriculum/steps_between_falls/stand_and_work",
         above=1500.0,
         least_steps=15_000_000,  # at first, in what is open by then, robots seldom fall
-        most_steps=60_000_000,
-        std=(0.07, 0.15),
+        most_steps=40_000_000,
+        std=(0.2, 0.3),
+        noise_at_rest=0.4,
         mixture=WORK,
         rewards=STEPPING,
         randomization=GENTLE,
@@ -179,7 +180,8 @@ STAGES = (
     Stage(
         "answer",
         most_steps=1_000_000,
-        std=(0.07, 0.15),
+        std=(0.2, 0.3),
+        noise_at_rest=0.4,
         prior=ANSWERS,
         mixture=WORK,
         rewards=STEPPING,
@@ -191,8 +193,8 @@ STAGES = (
         waits_for="curriculum/hardness",
         above=0.98,
         most_steps=40_000_000,
-        std=(0.3, 0.4),
-        noise_at_rest=0.25,
+        std=(0.2, 0.3),
+        noise_at_rest=0.4,
         mixture=EVERYTHING,
         rewards=EXACT,
         randomization=replace(GENTLE, hand_load_probability=0.4),
@@ -204,7 +206,8 @@ STAGES = (
         above=2000.0,
         least_steps=5_000_000,
         most_steps=40_000_000,
-        std=(0.04, 0.1),
+        std=(0.1, 0.15),
+        noise_at_rest=0.6,
         rollout_doublings=1,
         mixture=EVERYTHING,
         terrain=SLABS,
@@ -213,7 +216,7 @@ STAGES = (
     ),
     Stage(
         "refine",
-        std=(0.03, 0.08),
+        std=(0.05, 0.08),
         rollout_doublings=2,
         arms_act=True,
         mixture=EVERYTHING,
