@@ -13,14 +13,15 @@ import numpy as np
 import torch
 import tyro
 
-from evaluation.baselines.onnx_policy import load_controller
+from evaluation.baselines.onnx_policy import load_controller, load_controllers
 from evaluation.protocols.arena import BATCH, Arena, batch_steps
+from evaluation.protocols.conditions import condition_of
+from evaluation.protocols.fairness import common_supports, require_common
 from evaluation.protocols.skills import EPISODES as SKILL_EPISODES
 from evaluation.protocols.skills import FLAT, SKILLS, run_skills, skill_episodes
 from evaluation.protocols.suites import suite_of
 from evaluation.protocols.tracking import (
     WALK_EPISODES,
-    conditions_of,
     mode_episodes,
     motion_modes,
     run_modes,
@@ -35,7 +36,6 @@ from evaluation.reporting.reports import (
     write_results,
 )
 from evaluation.tracking_report import Evaluation, Measured, summary, write_report
-from lowlevel.commands import CommandSpace
 from lowlevel.control.controller import Controller, add_metrics
 from lowlevel.control.whole_body import Supports, WholeBodyController
 from lowlevel.runs.command_line import command_line
@@ -57,9 +57,9 @@ class Arguments:
     """Terrain: simple (flat and slabs that differ by ±2 cm, half of the episodes each), flat, slabs, or full (flat,
     rough, slopes, stairs and platforms in five levels each, all to be crossed)."""
     condition: str = "nominal"
-    """What is other than in the protocol: late-20ms, late-40ms (latency of the targets), slippery (friction 0.4),
-    other-gains (every stiffness and damping off by up to 20 %), weak-motors (80 % of the torque limits), weak-waist
-    (35 N m at waist roll and pitch)."""
+    """What is other than in the protocol, a name of :data:`evaluation.protocols.conditions.CONDITIONS`: late-40ms
+    (targets), slippery (friction 0.4), other-gains (each off by up to 20 %), weak-motors (80 % of the torque limits),
+    pushes-0.8 (m/s) and so on. ``evaluate-robustness`` runs all of them."""
     episodes: int = 500
     """Episodes of 20 s."""
     seed: int = 0
@@ -96,17 +96,15 @@ def _run(arguments: Arguments) -> None:
     if not 0 <= arguments.record <= min(arguments.robots, arguments.episodes):
         raise PilotError("--record must be between 0 and the number of episodes and of robots")
     suite_of(arguments.suite)
-    conditions_of(arguments.condition)
+    condition_of(arguments.condition)
     if arguments.write_metrics and arguments.condition != "nominal":
         raise PilotError("--write-metrics is for figures under the nominal condition: leave one of the two out")
     check_output(arguments.output)
     name, controller = load_controller(arguments.controller)
     if arguments.write_metrics and not isinstance(controller, Controller):
         raise PilotError(f"--write-metrics stores figures in a controller's folder, and {arguments.controller} is none")
-    others = dict(load_controller(path) for path in arguments.against)
-    if len(others) < len(arguments.against):
-        raise PilotError("two of the controllers to compare with have the same name or are the same: leave one out")
-    if arguments.write_metrics and not common_supports(controller, others).covers(controller.supports):
+    others = load_controllers(arguments.against)
+    if arguments.write_metrics and not common_supports([controller, *others.values()]).covers(controller.supports):
         raise PilotError("--write-metrics is for figures of all commands, and these controllers share only some")
     # Small matrix products only lose time to waking threads, and the physics wants the cores.
     torch.set_num_threads(1)
@@ -134,11 +132,11 @@ def evaluate(
     """Run the protocol, the walking test and the skill tests with all controllers, the motion modes with the first."""
     began = time.monotonic()
     suite = suite_of(arguments.suite)
-    supports = common_supports(controller, others)
+    supports = common_supports([controller, *others.values()])
     arena = _arena(controller, suite.terrain, arguments, supports)
-    _require_common(supports, arena.space)
+    require_common(supports, arena.space)
     space, seed = arena.space, arguments.seed
-    protocol = suite.episodes(space, arguments.episodes, seed)
+    protocol = condition_of(arguments.condition).disturbed(suite.episodes(space, arguments.episodes, seed))
     walk_terrain = FLAT if suite.crosses else suite.terrain
     walks = walking_episodes(space, arguments.walk_episodes, seed, len(walk_terrain.tiles))
     modes = mode_episodes(space, seed) if arena.experts else []
@@ -184,23 +182,16 @@ def evaluate(
 
 
 def _arena(tested: WholeBodyController, terrain: TerrainConfig, arguments: Arguments, supports: Supports) -> Arena:
-    conditions, threads = conditions_of(arguments.condition), arguments.threads
-    return Arena(tested, terrain, conditions, num_threads=threads, batch=arguments.robots, supports=supports)
-
-
-def common_supports(controller: WholeBodyController, others: Mapping[str, WholeBodyController]) -> Supports:
-    """What all of them can be told."""
-    supports = controller.supports
-    for other in others.values():
-        supports = supports & other.supports
-    return supports
-
-
-def _require_common(supports: Supports, space: CommandSpace) -> None:
-    for doing, bounds in (("stand", supports.standing), ("walk", supports.walking)):
-        for name, apart in zip(space.names, (bounds.lower > bounds.upper).tolist(), strict=True):
-            if apart:
-                raise PilotError(f"the controllers have no {name} in common while they {doing}: compare fewer of them")
+    condition = condition_of(arguments.condition)
+    return Arena(
+        tested,
+        terrain,
+        condition.randomization,
+        num_threads=arguments.threads,
+        batch=arguments.robots,
+        supports=supports,
+        options=condition.options,
+    )
 
 
 def _record(controller: WholeBodyController, arguments: Arguments, folder: Path, supports: Supports) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from lowlevel.commands import is_walking
 from lowlevel.control.controller import CONFIG_FILE, ONNX_FILE, Controller, content_hash
 from lowlevel.control.observation import Proprioception
 from lowlevel.control.whole_body import Bounds, Supports, WholeBodyController
+from robots.errors import PilotError
 from robots.g1.constants import ARM_JOINTS, DEFAULT_POSITION, JOINT_NAMES, Gains, joint_index
 from robots.g1.model import build_spec, joint_limits
 
@@ -270,6 +272,18 @@ def load_controller(path: Path) -> tuple[str, WholeBodyController]:
     limits = torch.tensor(joint_limits(build_spec().compile()), dtype=torch.float32)[ARM_JOINTS]
     policy = load_policy(path, (limits[:, 0], limits[:, 1]))
     return policy.card.name, policy
+
+
+def load_controllers(paths: Sequence[Path]) -> dict[str, WholeBodyController]:
+    """Several controllers by what they are called, as :func:`load_controller` has it.
+
+    Raises:
+        PilotError: if one of them cannot be used, or two are the same.
+    """
+    controllers = dict(load_controller(path) for path in paths)
+    if len(controllers) < len(paths):
+        raise PilotError("two of the controllers have the same name or are the same: leave one out")
+    return controllers
 
 
 def load_policy(onnx_file: Path, arm_limits: tuple[Tensor, Tensor]) -> OnnxPolicy:

@@ -9,7 +9,7 @@ there until its next command begins, and is stood up for it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -160,6 +160,7 @@ class Arena:
         num_threads: physics threads.
         batch: robots simulated side by side (N).
         supports: what commands are cut to; by default what the controller can be told.
+        options: the robot's model; its gains are the controller's.
     """
 
     def __init__(
@@ -171,10 +172,11 @@ class Arena:
         num_threads: int = 2,
         batch: int = BATCH,
         supports: Supports | None = None,
+        options: ModelOptions = ModelOptions(),  # noqa: B008 (frozen)
     ) -> None:
         self.controller = controller
         self.batch = batch
-        self.world = World(ModelOptions(gains=controller.gains), terrain, batch, num_threads)
+        self.world = World(replace(options, gains=controller.gains), terrain, batch, num_threads)
         self.simulation = self.world.simulation
         self.period = self.simulation.control_period
         lower, upper = self.simulation.joint_lower, self.simulation.joint_upper

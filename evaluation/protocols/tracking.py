@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +34,6 @@ from lowlevel.commands import (
     shares,
 )
 from lowlevel.world.measures import TRACKING_FIGURES, velocity_error
-from lowlevel.world.randomization import RandomizationConfig
-from robots.errors import PilotError
 
 EPISODE_LENGTH = 20.0
 """[s]"""
@@ -49,18 +47,6 @@ TILE_SIZE = 16.0
 AVERAGING = 0.5
 """Time over which velocities are averaged for the errors that leave out the sway of a gait [s]."""
 
-_AS_IT_IS = RandomizationConfig.for_evaluation()
-CONDITIONS: dict[str, RandomizationConfig] = {
-    "nominal": _AS_IT_IS,
-    "late-20ms": replace(_AS_IT_IS, delay=(0.0, 1.0, 0.0)),
-    "late-40ms": replace(_AS_IT_IS, delay=(0.0, 0.0, 1.0)),
-    "slippery": replace(_AS_IT_IS, friction=(0.4, 0.4)),
-    "other-gains": replace(_AS_IT_IS, gain_scale=(0.8, 1.2)),
-    "weak-motors": replace(_AS_IT_IS, effort_scale=0.8),
-    "weak-waist": replace(_AS_IT_IS, waist_effort=(35.0, 35.0)),
-}
-"""What may be other than in the protocol, by name."""
-
 GROUPS = ("walk_and_work", "stand_and_work", "walk_only")
 """Groups of commands: locomotion with posture and arms, posture and arms alone, locomotion alone (I = 0)."""
 
@@ -73,17 +59,6 @@ MODE_EPISODES = 5
 """Episodes of each motion mode."""
 MODE_TIME = 6.0
 """Length of a motion-mode episode [s]."""
-
-
-def conditions_of(name: str) -> RandomizationConfig:
-    """Conditions by name.
-
-    Raises:
-        PilotError: if there are none of that name.
-    """
-    if name not in CONDITIONS:
-        raise PilotError(f"unknown condition {name!r}; choose one of {', '.join(CONDITIONS)}")
-    return CONDITIONS[name]
 
 
 def protocol_episodes(

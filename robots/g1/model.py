@@ -44,6 +44,10 @@ top of the next slab and are stopped by its side, even where slabs differ by a m
 _FOOT_SPHERE_HEIGHT = SOLE_OFFSET + _FOOT_SPHERE_RADIUS
 
 
+_TORSO_LOAD_RADIUS = 0.08
+"""[m]: 5 kg of a density of 2.3 kg/l."""
+
+
 @dataclass(frozen=True)
 class ModelOptions:
     """What the compiled model contains."""
@@ -62,6 +66,10 @@ class ModelOptions:
     """Most Newton iterations per step; it stops once converged. With 3, feet of friction 0.5 never come to rest."""
     friction: float = 1.0
     """Sliding friction coefficient of floor, feet and palms."""
+    armature_scale: float = 1.0
+    """Factor on the rotor inertia of all motors."""
+    torso_mass: float = 0.0
+    """Carried at the torso's center of mass, beside its own [kg]."""
 
 
 def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:
@@ -85,6 +93,11 @@ def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:
     _add_self_collision(spec)
     _add_body_points(spec)
     _add_sensors(spec)
+    if options.torso_mass > 0.0:
+        torso = spec.body(TORSO_BODY)
+        load = torso.add_body(name="torso_load", pos=torso.ipos)
+        ball = load.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[_TORSO_LOAD_RADIUS, 0, 0])
+        ball.mass, ball.contype, ball.conaffinity, ball.group = options.torso_mass, 0, 0, 3
     return spec
 
 
@@ -127,7 +140,7 @@ def _add_actuators(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     gains = options.gains
     for index, name in enumerate(JOINT_NAMES):
         joint = spec.joint(name)
-        joint.armature = ARMATURE[index]
+        joint.armature = options.armature_scale * ARMATURE[index]
         effort = float(EFFORT[index])
         # The limit belongs to the actuator: MuJoCo 4 no longer damps saturated joint limits implicitly.
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
