@@ -136,6 +136,8 @@ class PolicyCard:
     clock: Clock | None = None
     control_period: float = CONTROL_PERIOD
     """[s]"""
+    verified: dict[str, float] = field(default_factory=dict)
+    """What ``verify-policy`` measured when the card was written, by the name of its test."""
 
 
 def joint_names(patterns: Joints) -> tuple[str, ...]:
