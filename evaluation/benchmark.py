@@ -108,11 +108,12 @@ def measure_everything(arguments: Arguments, folder: Path, progress: Progress) -
     def next_is(name: str) -> None:
         progress.update(task, description=name, advance=1)
 
-    config = _training("simple", arguments)
+    config = _training(arguments)
     torch.set_num_threads(arguments.cores)
     trainer = Trainer(config, folder)
     figures = measure_training(trainer, arguments.updates, "training")
-    perceptive = Trainer(_training("vision", arguments), folder)
+    # The same task: what the map costs, and not what obstacles do.
+    perceptive = Trainer(replace(config, network=PRESETS["vision"].network), folder)
     figures |= measure_training(perceptive, arguments.updates, "perceptive_training")
     next_is("environment")
     figures |= measure_environment(trainer.environment, arguments.seconds)
@@ -136,9 +137,9 @@ def measure_everything(arguments: Arguments, folder: Path, progress: Progress) -
     return figures, content_hash(folder / "controller")
 
 
-def _training(preset: str, arguments: Arguments) -> TrainingConfig:
-    """The training of a preset with the benchmark's robots and cores, in its first stage without a gait prior."""
-    config = PRESETS[preset]
+def _training(arguments: Arguments) -> TrainingConfig:
+    """The blind training with the benchmark's robots and cores, in its first stage without a gait prior."""
+    config = PRESETS["simple"]
     environment = replace(config.environment, num_robots=arguments.robots, num_threads=arguments.cores)
     first = next(stage for stage in config.stages if stage.prior is None)
     return replace(config, environment=environment, stages=(first,))

@@ -33,6 +33,8 @@ class Arguments:
     """Parent folder of the run's folder."""
     name: str = ""
     """Name of the run's folder; preset and time by default."""
+    blind: Path | None = None
+    """Folder of a run without vision, with whose networks a new run with vision begins."""
     resume: Path | None = None
     """Folder of a run to continue with its own configuration; options given beside it replace parts of that."""
 
@@ -93,6 +95,8 @@ def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
     if distributed.rank() == 0:  # other ranks may come when this one has made the folder
         RunFolder(folder).require_unused()
     trainer = Trainer(replace(parsed.config, device=str(device)), folder)
+    if parsed.blind is not None:
+        trainer.begin_seeing(RunFolder(parsed.blind))
     if distributed.rank() == 0:
         trainer.run.claim()
     return trainer
@@ -100,6 +104,8 @@ def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
 
 def _resumed(parsed: Arguments) -> Trainer:
     assert parsed.resume is not None
+    if parsed.blind is not None:
+        raise PilotError("--blind is for a new run: leave it out beside --resume")
     trainer = Trainer(parsed.config, parsed.resume)
     trainer.load()
     for network in (trainer.ppo.actor, trainer.ppo.critic):

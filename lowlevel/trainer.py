@@ -27,6 +27,7 @@ from lowlevel.imitation.calibration import CalibrationConfig, calibrate
 from lowlevel.imitation.cloning import CloningConfig, PriorTeacher, clone
 from lowlevel.learning.ppo import PPO, PPOConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes
+from lowlevel.networks.sight import give_sight
 from lowlevel.runs.distributed import any_rank, average_over_ranks, rank, world_size
 from lowlevel.runs.interrupts import stop_on_signals
 from lowlevel.runs.progress import ProgressReport
@@ -307,6 +308,21 @@ class Trainer:
         if with_environment and rank() == 0 and "environment" in state:
             self.environment.load_state_dict(state["environment"])
             self.observation = state["observation"]
+
+    def begin_seeing(self, blind: RunFolder) -> None:
+        """Begin with the networks of a ``blind`` run, whose policy this one repeats until it makes use of the map.
+
+        Raises:
+            PilotError: if that run cannot be read, or this one's networks are not those with sight.
+        """
+        if not self.config.network.vision:
+            raise PilotError("networks that do not see cannot begin with those of a blind run: choose --preset vision")
+        state = blind.load()
+        if not torch.equal(state["action_scale"], self.environment.action_scale.cpu()):
+            raise PilotError(f"{blind.path} was trained with other action scales than those of these gains")
+        for name, network in self.ppo.learner.modules.items():
+            give_sight(network, state["ppo"][name])
+        self.ppo.learner.limit_noise()
 
     # -- progress ---------------------------------------------------------------------------------------------
 

@@ -136,8 +136,12 @@ class Learner:
         self.gait_clock = gait_clock
         self.noise_at_rest = 1.0
         """Noise of a robot whose gait clock rests, as a share of that of one that walks."""
-        self._modules = {"actor": self.actor, "critic": self.critic, "target_encoder": self.target_encoder}
-        for module in self._modules.values():
+        self.modules: dict[str, nn.Module] = {
+            "actor": self.actor,
+            "critic": self.critic,
+            "target_encoder": self.target_encoder,
+        }
+        for module in self.modules.values():
             broadcast([*module.parameters(), *module.buffers()])
         self.groups: dict[str, list[nn.Parameter]] = {
             "actor": self.actor.policy_parameters(),
@@ -266,14 +270,14 @@ class Learner:
 
     def state_dict(self) -> dict[str, Any]:
         """Networks and optimizers."""
-        state: dict[str, Any] = {name: module.state_dict() for name, module in self._modules.items()}
+        state: dict[str, Any] = {name: module.state_dict() for name, module in self.modules.items()}
         state["optimizers"] = {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()}
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a :meth:`state_dict`. The actor's rate goes on from where it was; the others are this
         configuration's."""
-        for name, module in self._modules.items():
+        for name, module in self.modules.items():
             module.load_state_dict(state[name])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])

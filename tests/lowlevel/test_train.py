@@ -70,6 +70,24 @@ def test_resumed_run_is_bit_exact_over_twenty_updates(tmp_path: Path) -> None:
     assert [without_clock(f) for f in figures] == [without_clock(f) for f in expected]
 
 
+def test_a_run_that_sees_begins_with_what_a_blind_one_does(tmp_path: Path) -> None:
+    (tmp_path / "blind").mkdir()
+    blind = Trainer(tiny(network=replace(TINY_NETWORK, vision=False)), tmp_path / "blind")
+    run(blind, 2)
+    blind.save()
+    seeing = Trainer(tiny(seed=3), tmp_path / "seeing")
+    seeing.begin_seeing(blind.run)
+    observation = blind.environment.reset()
+    torch.testing.assert_close(seeing.ppo.deterministic(observation), blind.ppo.deterministic(observation))
+    torch.testing.assert_close(
+        seeing.ppo.critic(observation["privileged"]), blind.ppo.critic(observation["privileged"])
+    )
+    figures = run(seeing, 2)
+    assert figures[-1]["learner/kl"] < 1.0
+    with pytest.raises(PilotError, match="choose --preset vision"):
+        blind.begin_seeing(blind.run)
+
+
 def test_same_seed_same_weights_other_seed_other_weights(tmp_path: Path) -> None:
     trainers = [Trainer(tiny(seed=seed), tmp_path) for seed in (1, 1, 2)]
     for trainer in trainers:
