@@ -11,6 +11,7 @@ import numpy as np
 import torch
 import tyro
 
+from evaluation.baselines.onnx_policy import load_controller
 from evaluation.pictures.painter import Painter, film_strip, following_camera, save_picture
 from evaluation.pictures.visuals import VisualTwin
 from evaluation.protocols.arena import Arena, constant
@@ -18,7 +19,7 @@ from evaluation.protocols.skills import HOLDING_ARMS
 from evaluation.reporting.reports import check_output
 from highlevel.registry import find_controller
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
-from lowlevel.control.controller import Controller
+from lowlevel.control.whole_body import Supports, WholeBodyController
 from lowlevel.runs.command_line import command_line
 from lowlevel.world.terrain import TerrainConfig
 from robots.errors import PilotError
@@ -61,7 +62,7 @@ class Arguments:
     """Draw a controller in a few commands, on slabs of up to 4 cm."""
 
     controller: Path | None = None
-    """Its folder; pilot-g1-simple by default."""
+    """Its folder, pilot-g1-simple by default, or the ONNX file of somebody else's policy that has a card."""
     output: Path = Path("runs/controller.png")
     """The picture; one of that name is replaced."""
     seed: int = 0
@@ -77,31 +78,34 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _run(arguments: Arguments) -> None:
     torch.set_num_threads(1)
-    folder = find_controller(arguments.controller)
+    controller = arguments.controller or find_controller(None)
     if arguments.output.is_dir():
         raise PilotError(f"--output is the picture, but {arguments.output} is a folder: name a file in it")
     check_output(arguments.output.parent)
-    pixels = draw(Controller.load(folder), arguments.seed)
+    pixels, fallen = draw(load_controller(controller)[1], arguments.seed)
+    if fallen:
+        raise PilotError(f"the robot falls when told {fallen[0]!r}: there is nothing to draw")
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     save_picture(arguments.output, pixels)
     print(f"{arguments.output}: {', '.join(pose.name for pose in POSES)}")
 
 
-def draw(controller: Controller, seed: int) -> np.ndarray:
-    """One strip with a picture of each of :data:`POSES`, left to right.
+def draw(
+    controller: WholeBodyController, seed: int, supports: Supports | None = None, tile: str = "irregular"
+) -> tuple[np.ndarray, list[str]]:
+    """One strip with a picture of each of :data:`POSES`, left to right, and the names of those in which it has fallen.
+
+    Commands are cut to ``supports``, by default what the controller can be told.
 
     Raises:
         NoOpenGLError: if this machine cannot render.
-        PilotError: if the robot falls in one of them.
     """
-    arena = Arena(controller, TerrainConfig(tiles=("irregular",)), batch=len(POSES))
-    neutral = controller.command_space.neutral()
+    arena = Arena(controller, TerrainConfig(tiles=(tile,)), batch=len(POSES), supports=supports)
+    neutral = arena.space.neutral()
     episodes = [constant(seed, DURATION, _command(pose, neutral), flag=1.0) for pose in POSES]
+    down = torch.zeros(len(POSES), dtype=torch.bool)
     for moment in arena.run(episodes):
-        down = moment.fell | moment.failed
-        if down.any():
-            pose = POSES[int(torch.nonzero(down)[0, 0])]
-            raise PilotError(f"the robot falls when told {pose.name!r}: there is nothing to draw")
+        down |= moment.fell | moment.failed
     twin = VisualTwin(arena.world.terrain.add_to)
     pictures = []
     with Painter(twin.model) as painter:
@@ -109,7 +113,7 @@ def draw(controller: Controller, seed: int) -> np.ndarray:
             twin.follow(arena.simulation, row)
             mujoco.mj_forward(twin.model, twin.data)
             pictures.append(painter.draw(twin.data, following_camera(twin.model, twin.data)))
-    return film_strip(pictures)
+    return film_strip(pictures), [pose.name for pose, fell in zip(POSES, down.tolist(), strict=True) if fell]
 
 
 def _command(pose: Pose, neutral: torch.Tensor) -> torch.Tensor:

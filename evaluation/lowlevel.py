@@ -112,7 +112,8 @@ def _run(arguments: Arguments) -> None:
     evaluation = evaluate(controller, name, arguments, others)
 
     def write(folder: Path) -> None:
-        write_report(folder, evaluation)
+        strips = _strips(folder, {name: controller, **others}, evaluation.supports) if others else {}
+        write_report(folder, evaluation, strips)
         if arguments.record:
             _record(controller, arguments, folder, evaluation.supports)
 
@@ -192,6 +193,23 @@ def _arena(tested: WholeBodyController, terrain: TerrainConfig, arguments: Argum
         supports=supports,
         options=condition.options,
     )
+
+
+def _strips(folder: Path, controllers: Mapping[str, WholeBodyController], supports: Supports) -> dict[str, str]:
+    """Draw every controller in commands that all of them support; file names by controller, none without OpenGL."""
+    from evaluation.gallery import draw  # OpenGL is seldom needed here
+    from evaluation.pictures.painter import NoOpenGLError, save_picture
+
+    files = {}
+    for number, (name, controller) in enumerate(controllers.items(), start=1):
+        try:
+            pixels, _ = draw(controller, 0, supports, "flat")
+        except NoOpenGLError as error:
+            print(error)
+            return {}
+        files[name] = f"strip-{number}.png"
+        save_picture(folder / files[name], pixels)
+    return files
 
 
 def _record(controller: WholeBodyController, arguments: Arguments, folder: Path, supports: Supports) -> None:

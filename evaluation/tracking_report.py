@@ -65,8 +65,8 @@ class Evaluation:
     """Time the evaluation took [s]."""
 
 
-def write_report(folder: Path, evaluation: Evaluation) -> None:
-    """Write ``report.md``, plots and ``metrics.json`` into ``folder``."""
+def write_report(folder: Path, evaluation: Evaluation, strips: Mapping[str, str]) -> None:
+    """Write ``report.md``, plots and ``metrics.json`` into ``folder``, which holds film ``strips`` by controller."""
     figures, paper = evaluation.ours.figures, evaluation.suite.paper
     cases = {"all": "", "steady": "_steady", **{group: f"_{group}" for group in GROUPS}}
     panels = {name: {label: figures[name + suffix] for label, suffix in cases.items()} for name in TRACKING_FIGURES}
@@ -85,7 +85,7 @@ def write_report(folder: Path, evaluation: Evaluation) -> None:
         plot_scatter(folder / "comparison.png", _paired_episodes(evaluation))
     if evaluation.suite.crosses:
         plot_overlays(folder / "crossing.png", _crossing_curves(evaluation), "size of the obstacle")
-    (folder / REPORT_FILE).write_text(report_text(evaluation))
+    (folder / REPORT_FILE).write_text(report_text(evaluation, strips))
     activations = {
         mode: [None if np.isnan(value) else float(value) for value in row]
         for mode, row in zip(evaluation.modes, evaluation.activations, strict=True)
@@ -113,7 +113,7 @@ def summary(evaluation: Evaluation) -> str:
     return "  ".join(f"{name} {format_figure(figures[name]).split(' ')[0]}" for name in names)
 
 
-def report_text(evaluation: Evaluation) -> str:
+def report_text(evaluation: Evaluation, strips: Mapping[str, str]) -> str:
     """``report.md``."""
     figures, groups = evaluation.ours.figures, {group: f"_{group}" for group in GROUPS}
     has_skills = "deep_bend_success" in figures
@@ -125,6 +125,7 @@ def report_text(evaluation: Evaluation) -> str:
         crossed=_crossing_table(figures) if evaluation.suite.crosses else "",
         figures=figures,
         paper=evaluation.suite.paper,
+        strips=strips,
         comparison=_comparison(evaluation) if evaluation.others else "",
         told=_told(evaluation.supports),
         by_group=_breakdown(figures, groups),

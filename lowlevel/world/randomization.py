@@ -194,10 +194,6 @@ class Randomizer:
         if config.push_velocity > 0.0:
             state.push_countdown[ids] = self._uniform(*config.push_interval, count)
 
-        spread = torch.tensor([config.map_drift, config.map_drift, config.map_offset], device=ids.device)
-        state.map_error[ids] = spread * self._uniform(-1.0, 1.0, count, 3)
-        state.map_delay[ids] = self._choice(config.map_delay, count)
-
         friction = self.simulation.per_robot("geom_friction")
         friction[rows[:, None], self._foot_geoms, 0] = state.friction[ids].cpu().numpy()
         if config.gain_scale != (1.0, 1.0):
@@ -218,6 +214,9 @@ class Randomizer:
         limit[rows[:, None], self._waist_motors, 1] = effort
         if config.added_mass != (0.0, 0.0) or config.center_of_mass_shift > 0.0:
             self._write_inertia(ids, rows)
+        spread = torch.tensor([config.map_drift, config.map_drift, config.map_offset], device=ids.device)
+        state.map_error[ids] = spread * self._uniform(-1.0, 1.0, count, 3)
+        state.map_delay[ids] = self._choice(config.map_delay, count)
 
     def _write_inertia(self, ids: Tensor, rows: np.ndarray) -> None:
         mass = self._nominal_mass + self.state.added_mass[ids].cpu().numpy()
