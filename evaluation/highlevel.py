@@ -38,6 +38,7 @@ from lowlevel.control.controller import content_hash
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.progress import ProgressReport
 from robots.errors import PilotError
+from robots.g1.model import describe_foreign
 
 EPISODES_FILE = "episodes.json"
 LIFT_STAGE = "lift"
@@ -58,6 +59,8 @@ class Arguments:
     """Name of the task."""
     controller: Path | None = None
     """Controller folder; by default the shipped one of the planner, and pilot-g1-simple for the expert."""
+    robot: Path | None = None
+    """MJCF of another model of the G1 to run on (docs/compare.md)."""
     episodes: int = 500
     """Episodes; episode i of a seed is the same for every planner."""
     seed: int = 0
@@ -111,6 +114,8 @@ def _run(arguments: Arguments) -> None:
     folder = controller_for(arguments.planner, arguments.controller)
     torch.set_num_threads(1)
     print(f"evaluating {arguments.planner} on {task.name}", flush=True)
+    if arguments.robot is not None:
+        print(describe_foreign(arguments.robot))
     evaluation = evaluate(arguments, folder)
     write_results(arguments.output, lambda output: write_report(output, evaluation))
     print(summary(evaluation))
@@ -135,7 +140,7 @@ def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
             for variant in grid
         ),
     ]
-    setting = Setting(arguments.planner, controller, arguments.seed, arguments.robots)
+    setting = Setting(arguments.planner, controller, arguments.seed, arguments.robots, arguments.robot)
     with ProgressReport() as progress:
         bar = progress.add_task("episodes", total=sum(run.count for run in runs))
         results = run_all(

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,7 @@ from lowlevel.runs.command_line import command_line
 from lowlevel.runs.progress import ProgressReport
 from lowlevel.world.terrain import TerrainConfig
 from robots.errors import PilotError
+from robots.g1.model import describe_foreign
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class Arguments:
     against: tuple[Path, ...] = ()
     """Controllers to compare with: same seeds, the same commands, which all of them support, and differences episode by
     episode."""
+    robot: Path | None = None
+    """MJCF of another model of the G1 to run on (docs/compare.md)."""
     suite: str = "simple"
     """Terrain: simple (flat and slabs that differ by ±2 cm, half of the episodes each), flat, slabs, or full (flat,
     rough, slopes, stairs and platforms in five levels each, all to be crossed)."""
@@ -97,8 +100,8 @@ def _run(arguments: Arguments) -> None:
         raise PilotError("--record must be between 0 and the number of episodes and of robots")
     suite_of(arguments.suite)
     condition_of(arguments.condition)
-    if arguments.write_metrics and arguments.condition != "nominal":
-        raise PilotError("--write-metrics is for figures under the nominal condition: leave one of the two out")
+    if arguments.write_metrics and (arguments.condition != "nominal" or arguments.robot is not None):
+        raise PilotError("--write-metrics is for figures of our robot under the nominal condition: leave it out")
     check_output(arguments.output)
     name, controller = load_controller(arguments.controller)
     if arguments.write_metrics and not isinstance(controller, Controller):
@@ -109,6 +112,8 @@ def _run(arguments: Arguments) -> None:
     # Small matrix products only lose time to waking threads, and the physics wants the cores.
     torch.set_num_threads(1)
     print(f"evaluating {arguments.controller} on the {arguments.suite} suite", flush=True)
+    if arguments.robot is not None:
+        print(describe_foreign(arguments.robot))
     evaluation = evaluate(controller, name, arguments, others)
 
     def write(folder: Path) -> None:
@@ -191,7 +196,7 @@ def _arena(tested: WholeBodyController, terrain: TerrainConfig, arguments: Argum
         num_threads=arguments.threads,
         batch=arguments.robots,
         supports=supports,
-        options=condition.options,
+        options=replace(condition.options, mjcf=arguments.robot),
     )
 
 

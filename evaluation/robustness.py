@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ from lowlevel.control.whole_body import WholeBodyController
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.progress import ProgressReport
 from robots.errors import PilotError
+from robots.g1.model import describe_foreign
 
 SUITE = suite_of("flat")
 SHOWN = ("fall_rate", "E_v", "E_omega", "E_h", "E_r", "E_p", "E_y", "E_arm")
@@ -51,6 +52,8 @@ class Arguments:
     """Controller folder, or the ONNX file of somebody else's policy that has a card (docs/compare.md)."""
     against: tuple[Path, ...] = ()
     """Controllers to compare with: the same commands, which all of them support."""
+    robot: Path | None = None
+    """MJCF of another model of the G1 to run on (docs/compare.md)."""
     episodes: int = 64
     """Episodes of 20 s under each condition."""
     seed: int = 0
@@ -81,6 +84,8 @@ def _run(arguments: Arguments) -> None:
     check_output(arguments.output)
     controllers = load_controllers((arguments.controller, *arguments.against))
     torch.set_num_threads(1)  # as evaluate-lowlevel does
+    if arguments.robot is not None:
+        print(describe_foreign(arguments.robot))
     results = evaluate(controllers, arguments)
     write_results(arguments.output, lambda folder: write_report(folder, results, arguments))
     print(f"report: {arguments.output / REPORT_FILE}   figures: {arguments.output / METRICS_FILE}")
@@ -102,7 +107,7 @@ def evaluate(controllers: Mapping[str, WholeBodyController], arguments: Argument
                     num_threads=arguments.threads,
                     batch=arguments.robots,
                     supports=supports,
-                    options=condition.options,
+                    options=replace(condition.options, mjcf=arguments.robot),
                 )
                 require_common(supports, arena.space)
                 episodes = condition.disturbed(SUITE.episodes(arena.space, arguments.episodes, arguments.seed))

@@ -11,8 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
+import tyro
 from torch import Tensor
 
 from highlevel.action import ActionMap, interpolate
@@ -52,6 +54,8 @@ class PhysicsConfig:
     """Newton iterations per step."""
     num_threads: int = 2
     """Physics threads."""
+    mjcf: Annotated[Path | None, tyro.conf.Suppress] = None
+    """Somebody else's MJCF of the robot, for evaluation."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,7 @@ class CommandEnvironment:
             timestep=physics.timestep,
             elliptic_friction=True,
             solver_iterations=physics.solver_iterations,
+            mjcf=physics.mjcf,
         )
         self.world = World(options, TerrainConfig(), num_envs, physics.num_threads, add_objects=task.add_to)
         self.simulation = self.world.simulation

@@ -36,6 +36,8 @@ class Setting:
     seed: int
     robots: int
     """Robots side by side in a run."""
+    mjcf: Path | None = None
+    """Somebody else's MJCF of the robot."""
 
 
 def run_all(
@@ -87,7 +89,7 @@ def run_all(
 def _run(
     run: Run, setting: Setting, threads: int, on_progress: Callable[[int], None] | None = None
 ) -> list[EpisodeRecord]:
-    physics = PhysicsConfig(num_threads=threads)
+    physics = PhysicsConfig(num_threads=threads, mjcf=setting.mjcf)
     environment = CommandEnvironment(run.task, setting.controller, setting.robots, physics=physics)
     policy = make_policy(setting.planner, environment, setting.controller)
     return run_episodes(environment, policy, run.count, setting.seed, on_progress=on_progress)

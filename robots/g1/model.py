@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from robots.errors import PilotError
 from robots.g1.constants import (
     ARMATURE,
     BODY_POINTS,
@@ -70,27 +72,30 @@ class ModelOptions:
     """Factor on the rotor inertia of all motors."""
     torso_mass: float = 0.0
     """Carried at the torso's center of mass, beside its own [kg]."""
+    mjcf: Path | None = None
+    """Somebody else's MJCF of the G1: its masses, inertias, joint limits and collisions instead of ours."""
 
 
 def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:
     """The robot as an editable MuJoCo specification; ``.compile()`` gives nq 36, nv 35, nu 29.
 
     Raises:
-        PilotError: if the URDF is not installed.
+        PilotError: if the URDF is not installed, or ``options.mjcf`` is no G1 with 29 joints.
     """
-    spec = mujoco.MjSpec.from_string(_urdf_with_floating_base(options.visuals))
+    spec = _own_robot(options.visuals) if options.mjcf is None else _foreign_robot(options.mjcf)
     _set_physics(spec, options)
-    for geom in spec.geoms:  # what the URDF brings is visual only
-        geom.contype, geom.conaffinity, geom.group = 0, 0, 2
     if options.floor:
         floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
         floor.contype, floor.conaffinity = 0, WORLD_COLLISION
         floor.friction = [options.friction, 0.005, 0.0001]
         floor.rgba = [0.55, 0.6, 0.65, 1.0]
     _add_actuators(spec, options)
-    _add_feet(spec, options)
+    _add_frames(spec)
     _add_palms(spec, options)
-    _add_self_collision(spec)
+    _add_limbs(spec)
+    if options.mjcf is None:
+        _add_feet(spec, options)
+        _add_self_collision(spec)
     _add_body_points(spec)
     _add_sensors(spec)
     if options.torso_mass > 0.0:
@@ -99,6 +104,56 @@ def build_spec(options: ModelOptions = ModelOptions()) -> mujoco.MjSpec:
         ball = load.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[_TORSO_LOAD_RADIUS, 0, 0])
         ball.mass, ball.contype, ball.conaffinity, ball.group = options.torso_mass, 0, 0, 3
     return spec
+
+
+def _own_robot(visuals: bool) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec.from_string(_urdf_with_floating_base(visuals))
+    for geom in spec.geoms:  # what the URDF brings is visual only
+        geom.contype, geom.conaffinity, geom.group = 0, 0, 2
+    return spec
+
+
+def _foreign_robot(path: Path) -> mujoco.MjSpec:
+    """The robot of an MJCF file without its actuators, sensors, sites and keyframes, and without its ground.
+
+    Raises:
+        PilotError: if it cannot be read, or lacks a body or a joint of the G1, or has others.
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise PilotError(f"cannot read the robot in {path}: {str(error).splitlines()[0]}") from error
+    joints = [joint.name for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    if joints != list(JOINT_NAMES):
+        missing, strange = sorted(set(JOINT_NAMES) - set(joints)), sorted(set(joints) - set(JOINT_NAMES))
+        what = f"lacks {missing[0]}" if missing else f"has {strange[0]}" if strange else "has them in another order"
+        raise PilotError(f"{path} is no G1 with the 29 joints that policies drive here: it {what}")
+    bodies = {body.name for body in spec.bodies}
+    for name in (PELVIS_BODY, TORSO_BODY, *FOOT_BODIES, *HAND_BODIES, *(point.body for point in BODY_POINTS)):
+        if name not in bodies:
+            raise PilotError(f"{path} has no body {name}: bodies must be called as in Unitree's models")
+    for element in (*spec.actuators, *spec.sensors, *spec.keys, *spec.sites):
+        spec.delete(element)
+    for geom in list(spec.geoms):
+        if geom.parent.name == "world":
+            spec.delete(geom)
+        elif geom.contype or geom.conaffinity:
+            # It touches the ground and what stands on it, and itself as its file says.
+            geom.contype |= WORLD_COLLISION
+            if geom.parent.name in FOOT_BODIES:
+                geom.priority = 1
+    return spec
+
+
+def describe_foreign(path: Path) -> str:
+    """What of the robot in an MJCF file is its own, and what is ours all the same, in one sentence."""
+    spec = _foreign_robot(path)
+    bare = [joint.name for joint in spec.joints if joint.name in JOINT_NAMES and not joint.armature]
+    rotors = f"our rotor inertias for the {len(bare)} joints that have none" if bare else "its rotor inertias"
+    return (
+        f"the robot of {path}: its masses, joint limits and collisions, {rotors}; our gains, torque limits, palms, and "
+        "places of soles and body points"
+    )
 
 
 def _urdf_with_floating_base(visuals: bool) -> str:
@@ -140,7 +195,7 @@ def _add_actuators(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     gains = options.gains
     for index, name in enumerate(JOINT_NAMES):
         joint = spec.joint(name)
-        joint.armature = options.armature_scale * ARMATURE[index]
+        joint.armature = options.armature_scale * (joint.armature or ARMATURE[index])
         effort = float(EFFORT[index])
         # The limit belongs to the actuator: MuJoCo 4 no longer damps saturated joint limits implicitly.
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -151,10 +206,18 @@ def _add_actuators(spec: mujoco.MjSpec, options: ModelOptions) -> None:
         actuator.forcerange = [-effort, effort]
 
 
+def _add_frames(spec: mujoco.MjSpec) -> None:
+    """Sites at the centers of soles and palms."""
+    for side, foot, hand in zip(SIDES, FOOT_BODIES, HAND_BODIES, strict=True):
+        spec.body(foot).add_site(name=f"{side}_foot", pos=[SOLE_CENTER, 0.0, SOLE_OFFSET])
+        inwards = -1.0 if side == "left" else 1.0
+        palm = [PALM_OFFSET[0], inwards * PALM_HALF_THICKNESS, PALM_OFFSET[2]]
+        spec.body(hand).add_site(name=f"{side}_palm", pos=palm)
+
+
 def _add_feet(spec: mujoco.MjSpec, options: ModelOptions) -> None:
-    for side, body_name in zip(SIDES, FOOT_BODIES, strict=True):
+    for body_name, side in zip(FOOT_BODIES, SIDES, strict=True):
         body = spec.body(body_name)
-        body.add_site(name=f"{side}_foot", pos=[SOLE_CENTER, 0.0, SOLE_OFFSET])
         for number, (x, y) in enumerate(_FOOT_SPHERES):
             sphere = body.add_geom(name=f"{side}_foot_{number}", type=mujoco.mjtGeom.mjGEOM_SPHERE)
             sphere.size = [_FOOT_SPHERE_RADIUS, 0, 0]
@@ -174,9 +237,7 @@ def _add_palms(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     The URDF's rubber hands are visual only, so without these the palms would pass through a box.
     """
     for side, body_name in zip(SIDES, HAND_BODIES, strict=True):
-        inwards = -1.0 if side == "left" else 1.0
         body = spec.body(body_name)
-        body.add_site(name=f"{side}_palm", pos=[PALM_OFFSET[0], inwards * PALM_HALF_THICKNESS, PALM_OFFSET[2]])
         parts = (
             ("palm", [PALM_OFFSET[0], 0.0, 0.0], [0.05, PALM_HALF_THICKNESS, 0.045]),
             ("wrist", [0.02, 0.0, 0.0], [0.03, PALM_HALF_THICKNESS, 0.025]),
@@ -193,8 +254,8 @@ def _add_palms(spec: mujoco.MjSpec, options: ModelOptions) -> None:
             box.group = 3
 
 
-def _add_self_collision(spec: mujoco.MjSpec) -> None:
-    """Capsules for thighs, shins and forearms, and explicit pairs; contype 0 keeps them out of everything else."""
+def _add_limbs(spec: mujoco.MjSpec) -> None:
+    """Capsules for thighs, shins and forearms, for explicit pairs; contype 0 keeps them out of everything else."""
     for side in SIDES:
         for body_name, start, end, radius in (
             (f"{side}_hip_yaw_link", (0.0, 0.0, -0.02), (-0.07, 0.0, -0.16), 0.055),
@@ -206,6 +267,10 @@ def _add_self_collision(spec: mujoco.MjSpec) -> None:
             capsule.fromto = [*start, *end]
             capsule.size = [radius, 0, 0]
             capsule.mass, capsule.contype, capsule.conaffinity, capsule.group = 0.0, 0, 0, 3
+
+
+def _add_self_collision(spec: mujoco.MjSpec) -> None:
+    """Plates for the feet, and explicit pairs."""
     for name in FOOT_BODIES:
         plate = spec.body(name).add_geom(name=f"{name}_plate", type=mujoco.mjtGeom.mjGEOM_BOX)
         plate.pos, plate.size = [SOLE_CENTER, 0.0, -0.02], [0.085, 0.03, 0.012]
