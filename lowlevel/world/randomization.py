@@ -57,7 +57,7 @@ class RandomizationConfig:
     push_interval: tuple[float, float] = (4.0, 8.0)
     """Time between pushes [s]."""
     map_offset: float = 0.05
-    """Half-width of the vertical error of an episode's elevation maps [m] (AME-2, arXiv 2601.08485)."""
+    """Half-width of the vertical error of an episode's elevation maps [m] (as jalenzz/AME_Locomotion)."""
     map_drift: float = 0.05
     """Largest horizontal error of the maps, per axis [m]: that of the estimated position, which wanders."""
     map_delay: tuple[float, float, float] = (0.4, 0.4, 0.2)
