@@ -21,15 +21,6 @@ import torch
 import tyro
 from rich.progress import Progress
 
-from evaluation.protocols.speed import (
-    WINDOWS,
-    measure_environment,
-    measure_latency,
-    measure_training,
-    plain_rates,
-    planner_rates,
-    single_planner_rates,
-)
 from evaluation.reporting.reports import (
     METRICS_FILE,
     REPORT_FILE,
@@ -40,6 +31,15 @@ from evaluation.reporting.reports import (
     write_results,
 )
 from evaluation.reporting.statistics import Figure, mean_figure
+from evaluation.speed.measurements import (
+    WINDOWS,
+    measure_environment,
+    measure_latency,
+    measure_training,
+    plain_rates,
+    planner_rates,
+    single_planner_rates,
+)
 from highlevel.registry import load_task
 from lowlevel.control.controller import Controller, content_hash
 from lowlevel.export import export_controller

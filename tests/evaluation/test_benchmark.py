@@ -9,8 +9,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from evaluation.benchmark import main
-from evaluation.protocols.plain_env import PlainMujocoEnv
-from evaluation.protocols.speed import measure_environment, measure_latency, window_rates
+from evaluation.speed.measurements import measure_environment, measure_latency, window_rates
+from evaluation.speed.plain_env import PlainMujocoEnv
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 
 
@@ -25,7 +25,7 @@ def test_rates_count_work_per_second() -> None:
 
 
 def test_the_shares_of_an_environment_step_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evaluation.protocols.speed.WINDOWS", 1)
+    monkeypatch.setattr("evaluation.speed.measurements.WINDOWS", 1)
     standing = EnvironmentConfig(num_robots=8, num_threads=1, start_moving=0.0, mixture=(("stand", 1.0),))
     environment = PilotEnvironment(standing)  # nobody falls so soon: resets count as neither physics nor Python
     environment.reset()

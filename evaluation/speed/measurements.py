@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from evaluation.protocols.plain_env import PlainMujocoEnv
 from evaluation.reporting.statistics import Figure, mean_figure, quantile_figure
+from evaluation.speed.plain_env import PlainMujocoEnv
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.gym_env import PlannerEnv
 from highlevel.registry import load_task

@@ -1,0 +1,1 @@
+"""How fast things are: what the benchmark measures, and what it compares with."""
