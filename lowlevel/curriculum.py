@@ -37,7 +37,7 @@ class CurriculumConfig:
     steps_between_falls: float = 300.0
     """Control steps of a kind per fall above which it may grow; below half as many it shrinks. Where every robot falls
     no action is better than another, and nothing is learned."""
-    hard_steps_between_falls: float = 1000.0
+    hard_steps_between_falls: float = 2000.0
     """Control steps per fall, of all kinds together, above which the conditions get harder; below half as many they
     ease. At a fall every 600 steps the robots learn not to fall and track no better."""
     smoothing: float = 0.1

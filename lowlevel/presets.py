@@ -192,6 +192,7 @@ STAGES = (
         calibrates=True,
         waits_for="curriculum/hardness",
         above=0.98,
+        least_steps=15_000_000,
         most_steps=40_000_000,
         std=(0.2, 0.3),
         noise_at_rest=0.4,
