@@ -102,12 +102,12 @@ def test_air_time_counts_the_shorter_role_up_to_its_limit(standing: Transition) 
 def test_gait_terms_follow_the_clock(standing: Transition) -> None:
     """At a quarter of the cycle the left foot is at mid-swing and the right one bears the robot."""
     walking = replace(standing, phase=torch.full((4,), torch.pi / 2), walking=torch.ones(4, dtype=torch.bool))
-    clearance = torch.tensor([[0.09, 0.0], [0.04, 0.0], [0.0, 0.0], [0.0, 0.09]])
+    clearance = torch.tensor([[0.06, 0.0], [0.04, 0.0], [0.0, 0.0], [0.0, 0.06]])
     contact = torch.tensor([[False, True], [True, True], [False, False], [True, False]])
     feet = moved(walking, foot_clearance=clearance, foot_contact=contact)
     assert term("contact_schedule", feet) == [1.0, 0.5, 0.5, 0.0]
-    assert term("swing_height", feet) == pytest.approx([0.75, 1.0 / 3.0, 0.0, 0.0])
-    errors = [0.03**2, 0.08**2, 0.12**2, 0.12**2 + 0.09**2]
+    assert term("swing_height", feet) == pytest.approx([0.75, 0.5, 0.0, 0.0])
+    errors = [0.02**2, 0.04**2, 0.08**2, 0.08**2 + 0.06**2]
     assert term("foot_phase", feet) == pytest.approx([2.718281828 ** (-error / 0.005) for error in errors])
     still = replace(feet, walking=torch.zeros(4, dtype=torch.bool))
     assert term("swing_height", still) == [0.0] * 4
