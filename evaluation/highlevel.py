@@ -284,6 +284,7 @@ def report_text(evaluation: Evaluation, figures: dict[str, Figure]) -> str:
         planner=evaluation.planner,
         controller=evaluation.controller,
         count=len(evaluation.records),
+        robot=evaluation.arguments.robot,
         headline=HEADLINE,
         stages=evaluation.stages,
         figures=figures,

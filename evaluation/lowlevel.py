@@ -117,7 +117,9 @@ def _run(arguments: Arguments) -> None:
     evaluation = evaluate(controller, name, arguments, others)
 
     def write(folder: Path) -> None:
-        strips = _strips(folder, {name: controller, **others}, evaluation.supports) if others else {}
+        # Pictures are of our robot.
+        drawn = {name: controller, **others} if others and arguments.robot is None else {}
+        strips = _strips(folder, drawn, evaluation.supports)
         write_report(folder, evaluation, strips)
         if arguments.record:
             _record(controller, arguments, folder, evaluation.supports)
@@ -174,7 +176,7 @@ def evaluate(
     return Evaluation(
         suite=suite,
         name=arguments.suite,
-        condition=arguments.condition,
+        condition=arguments.condition if arguments.robot is None else f"{arguments.condition}, robot {arguments.robot}",
         seed=seed,
         controller=name,
         supports=supports,
