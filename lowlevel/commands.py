@@ -83,6 +83,8 @@ class CommandKind:
     """Ranges of roll, pitch and yaw [rad]."""
     arms: bool = False
     """Whether the arms move; they hang at their default otherwise."""
+    arms_alike: bool = False
+    """Whether the right arm does the mirror image of what the left one does."""
     tracks: bool = False
     """The tracking flag I."""
     steering: float = 1.0
@@ -105,9 +107,13 @@ KINDS: dict[str, CommandKind] = {
     "squat": CommandKind(height=(0.30, 0.76), torso=((0.0, 0.0), (-0.1, 0.9), (0.0, 0.0)), tracks=True),
     "walk_and_work": CommandKind(_VELOCITY, height=_WALKING_HEIGHT, torso=_WALKING_TORSO, arms=True, tracks=True),
     "stand_and_work": CommandKind(height=(0.30, 0.76), torso=_TORSO, arms=True, tracks=True),
+    "walk_and_hold": CommandKind(
+        _VELOCITY, height=_WALKING_HEIGHT, torso=_WALKING_TORSO, arms=True, arms_alike=True, tracks=True
+    ),
+    "stand_and_hold": CommandKind(height=(0.30, 0.76), torso=_TORSO, arms=True, arms_alike=True, tracks=True),
 }
 """Kinds of command by name. Training draws few at a time: over the whole command space the policy gradient is nearly
-all noise."""
+all noise. Arms that are drawn one by one seldom both reach forwards, as those of a robot that holds a box do."""
 
 Mixture = tuple[tuple[str, float], ...]
 """Kinds with their shares, which add up to 1."""
@@ -130,6 +136,10 @@ class CommandSampler:
         boxes = column(lambda kind: (*kind.velocity, kind.height, *kind.torso))
         self._low, self._high = boxes.unbind(-1)
         self._arms, self._tracks = column(lambda kind: kind.arms), column(lambda kind: kind.tracks)
+        self._arms_alike = column(lambda kind: kind.arms_alike) > 0.0
+        self._is_right = torch.tensor([name.startswith("right") for name in space.names[ARMS]], device=device)
+        self._partner = torch.tensor(ARMS_MIRROR.index, device=device)
+        self._sign = torch.tensor(ARMS_MIRROR.sign, dtype=torch.float32, device=device)
         self._steering = column(lambda kind: kind.steering)
 
     def draw_kinds(self, count: int, probabilities: Tensor, generator: torch.Generator) -> Tensor:
@@ -154,6 +164,8 @@ class CommandSampler:
         wanted[:, 1:3] *= uniform(count, 2) < self._steering[kinds, None]
         neutral = self.neutral[: ARMS.start]
         arms = self._sample_arms(count, (open_to * self._arms[kinds, None]), generator)
+        follows = self._arms_alike[kinds, None] & self._is_right
+        arms = torch.where(follows, arms[:, self._partner] * self._sign, arms)
         command = torch.cat([neutral + open_to * (wanted - neutral), arms], dim=1)
         stands = command[:, VELOCITY].norm(dim=-1) < STANDING_SPEED
         command[stands, VELOCITY] = 0.0

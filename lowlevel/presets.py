@@ -76,11 +76,13 @@ EVERYTHING = (
     ("steer", 0.12),
     ("slow", 0.08),
     ("stand", 0.05),
-    ("stand_and_work", 0.25),
-    ("walk_and_work", 0.5),
+    ("stand_and_work", 0.2),
+    ("stand_and_hold", 0.1),
+    ("walk_and_work", 0.35),
+    ("walk_and_hold", 0.1),
 )
-"""Unlike the evaluation it also stands in the neutral posture, what a planner starts from and stops in, and walks
-slowly."""
+"""Unlike the evaluation it also stands in the neutral posture, what a planner starts from and stops in, walks slowly,
+and holds both arms alike, as around a box."""
 
 SLABS = TerrainConfig(tiles=("flat", "irregular"), tile_size=8.0)
 """The simple terrain of the paper: flat, and irregular by 2 cm."""

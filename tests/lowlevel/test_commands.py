@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -20,6 +21,7 @@ from lowlevel.commands import (
     is_walking,
     shares,
 )
+from robots.g1.mirror import ARMS_MIRROR
 from robots.g1.model import build_spec, joint_limits
 
 
@@ -71,6 +73,14 @@ def test_every_kind_stays_in_its_box(space: CommandSpace) -> None:
         assert (command[:, :7] >= boxes[:, 0] - 1e-6).all() and (command[:, :7] <= boxes[:, 1] + 1e-6).all(), name
         assert (flag == float(kind.tracks)).all()
         assert torch.equal(command[:, ARMS], space.neutral()[ARMS].expand(4000, -1)) is not kind.arms
+
+
+def test_arms_that_hold_are_mirror_images_of_each_other_and_others_are_not(space: CommandSpace) -> None:
+    for name, kind in KINDS.items():
+        if kind.arms:
+            arms = draw(space, ((name, 1.0),))[0][:, ARMS].numpy()
+            assert np.array_equal(ARMS_MIRROR(arms), arms) is kind.arms_alike, name
+            assert ARMS_MIRROR(arms)[:, 0].std() > 0.3
 
 
 def test_unknown_kinds_and_wrong_shares_are_refused() -> None:
