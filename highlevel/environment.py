@@ -25,6 +25,7 @@ from lowlevel.runs.checks import require_finite
 from lowlevel.world.measures import Measurement
 from lowlevel.world.terrain import TerrainConfig
 from lowlevel.world.world import World
+from robots.errors import PilotError
 from robots.g1.constants import DEFAULT_POSITION, NUM_JOINTS
 from robots.g1.model import ModelOptions
 
@@ -98,6 +99,9 @@ class CommandEnvironment:
         num_envs: robots side by side.
         seed: seed of the episodes; robot i runs episodes i, i + N, i + 2 N, ...
         physics: accuracy and threads.
+
+    Raises:
+        PilotError: if another environment has the task.
     """
 
     def __init__(
@@ -108,6 +112,9 @@ class CommandEnvironment:
         seed: int = 0,
         physics: PhysicsConfig | None = None,
     ) -> None:
+        if task.is_taken:
+            raise PilotError(f"this task {task.name!r} belongs to another environment already: make a task for each")
+        task.is_taken = True
         self.task = task
         given = controller if isinstance(controller, Controller) else Controller.load(controller)
         self.controller = given.twin(num_envs)

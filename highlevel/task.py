@@ -89,7 +89,8 @@ class Task(ABC):
     scene.
 
     The order of calls: :meth:`add_to` once, :meth:`attach` once, then :meth:`reset` for robots that begin an
-    episode and :meth:`step` for all of them after every control step; the observations at any time.
+    episode and :meth:`step` for all of them after every control step; the observations at any time. A task remembers
+    the episodes of its robots, so that it belongs to one environment.
     """
 
     name: str
@@ -106,6 +107,8 @@ class Task(ABC):
     """Additions to the paper's observation; they come last."""
     sweeps: tuple[Sweep, ...] = ()
     """Conditions over which an evaluation can map success; the task then has a ``config`` and is made from one."""
+    is_taken: bool = False
+    """Whether an environment has taken it over."""
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:

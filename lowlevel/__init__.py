@@ -1,1 +1,3 @@
 """PILOT's low-level policy: batch simulation, environment, networks, PPO and the frozen controller."""
+
+from lowlevel.runs import processes as processes

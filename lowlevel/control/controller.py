@@ -54,6 +54,10 @@ CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
 )
 
 
+LOST_AFTER = 10
+"""Control steps in a row without usable measurements after which a robot counts as lost: 0.2 s."""
+
+
 class ControllerError(PilotError):
     """A controller folder cannot be used; the message says which file is at fault and why."""
 
@@ -107,6 +111,9 @@ class Controller:
     """A frozen policy with its memory.
 
     Call :meth:`reset` once for a number of robots, then :meth:`act` every control period.
+
+    A robot one of whose inputs is not finite, such as a sensor sample that was lost, keeps its last targets for that
+    control period (:attr:`holds`) and remembers nothing of it; :attr:`lost` says when that has lasted too long.
     """
 
     def __init__(
@@ -125,6 +132,9 @@ class Controller:
         self.pose = NominalPose.load(device) if pose is None else pose
         self.step = step
         self._memory: Memory = {}
+        self._default = torch.tensor(config.default_position, dtype=torch.float32, device=self.device)
+        self._targets = self._default[None]
+        self._steps_held = torch.zeros(1, dtype=torch.long, device=self.device)
         self.gate = torch.zeros(0)
         """Expert activations of the last :meth:`act` (N, experts)."""
 
@@ -151,14 +161,30 @@ class Controller:
 
     # -- control ----------------------------------------------------------------------------------------------
 
+    @property
+    def holds(self) -> Tensor:
+        """Robots that keep earlier targets, because an input of the last :meth:`act` was not finite (N,)."""
+        return self._steps_held > 0
+
+    @property
+    def lost(self) -> Tensor:
+        """Robots that have kept them for LOST_AFTER control steps (N,): damp their motors."""
+        return self._steps_held >= LOST_AFTER
+
     def reset(self, num_robots: int, ids: Tensor | None = None) -> None:
         """Forget everything about robots ``ids`` (all ``num_robots`` by default)."""
         fresh = self.step.first_memory(num_robots)
         if not self._memory or ids is None or len(self._memory["action"]) != num_robots:
             self._memory = fresh
+            self._targets = self._default.repeat(num_robots, 1)
+            self._steps_held = torch.zeros(num_robots, dtype=torch.long, device=self.device)
             return
-        for name, cleared in fresh.items():
-            self._memory[name][ids] = cleared[ids]
+        # Into copies: what was computed in inference mode cannot be written to outside of it.
+        begins = torch.zeros(num_robots, dtype=torch.bool, device=self.device)
+        begins[ids] = True
+        self._memory = {name: _rows_where(begins, cleared, self._memory[name]) for name, cleared in fresh.items()}
+        self._targets = _rows_where(begins, self._default.expand_as(self._targets), self._targets)
+        self._steps_held = torch.where(begins, 0, self._steps_held)
 
     @torch.no_grad()
     def act(self, proprioception: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor) -> Tensor:
@@ -176,8 +202,12 @@ class Controller:
         if not self._memory or len(self._memory["action"]) != len(command):
             raise RuntimeError(f"call reset({len(command)}) before act() with {len(command)} robots")
         result = self.step(proprioception, elevation_map, command, flag, self._memory)
-        self.gate, self._memory = result.gate, result.memory
-        return result.targets
+        usable = _all_finite(*vars(proprioception).values(), elevation_map, command, flag)
+        self._steps_held = torch.where(usable, 0, self._steps_held + 1)
+        memory = {name: _rows_where(usable, value, self._memory[name]) for name, value in result.memory.items()}
+        self.gate, self._memory = _rows_where(usable, result.gate, torch.zeros_like(result.gate)), memory
+        self._targets = _rows_where(usable, result.targets, self._targets)
+        return self._targets
 
     def clamp_command(self, command: Tensor) -> Tensor:
         """The command (N, 21) that is observed and scored in place of ``command``."""
@@ -245,6 +275,15 @@ class Controller:
         return controller
 
 
+def _all_finite(*tensors: Tensor) -> Tensor:
+    """Robots all of whose numbers in ``tensors`` (N, ...) are finite (N,)."""
+    return torch.isfinite(torch.cat([tensor.flatten(1) for tensor in tensors], dim=1)).all(dim=1)
+
+
+def _rows_where(chosen: Tensor, values: Tensor, others: Tensor) -> Tensor:
+    return torch.where(chosen.view(-1, *[1] * (values.dim() - 1)), values, others)
+
+
 def _standing(config: ControllerConfig, device: torch.device | str) -> tuple[Proprioception, Tensor, Tensor, Tensor]:
     """What a controller is given for one robot that stands as it is told."""
     command = config.command_space.neutral(device)[None]
@@ -268,7 +307,7 @@ def save_controller(
     controller = Controller(config, step, provenance)
     controller.reset(GOLDEN_ROBOTS)
     golden = golden_vectors(controller, config.command_space, seed=0)
-    export_step(step, config.command_space, folder / ONNX_FILE)
+    export_step(step, config.command_space, asdict(config), folder / ONNX_FILE)
     atomic_write(folder / GOLDEN_FILE, lambda file: file.write(json.dumps(golden).encode()))
     _FOLDER.write_description(
         folder, config, provenance, policy=asdict(policy), observation_layout=observation_layout()
@@ -342,7 +381,7 @@ def _read_onnx(folder: Path, device: torch.device | str) -> OnnxStep:
     try:
         # ONNX Runtime's own errors are private to it.
         onnx.checker.check_model(onnx.load(path))
-        return OnnxStep(path)
+        return OnnxStep(path.read_bytes())
     except (DecodeError, onnx.checker.ValidationError) as error:
         raise ControllerError(f"{path} is damaged or truncated: {error}") from error
     except (KeyError, ValueError) as error:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import onnx
 import onnxruntime
@@ -34,6 +35,11 @@ INPUTS = (
 FIRST_MEMORY = "first_memory"
 """Metadata entry of the file: JSON, name of each memory input to its value for one robot that has not acted yet. Every
 memory input x has an output next_x."""
+CONVENTIONS = "conventions"
+"""Metadata entry of the file: JSON, the "config" of ``controller.json``, such as joint names, default pose, gains,
+control period and command space."""
+IR_VERSION = 10
+"""Of the file: what ONNX Runtime has read since version 1.19 of August 2024."""
 
 
 class _Flat(nn.Module):
@@ -49,8 +55,8 @@ class _Flat(nn.Module):
         return result.targets, result.gate, *(result.memory[name] for name in self.memory)
 
 
-def export_step(step: ControlStep, space: CommandSpace, path: Path) -> None:
-    """Write ``step`` as an ONNX file, for any number of robots."""
+def export_step(step: ControlStep, space: CommandSpace, conventions: dict[str, Any], path: Path) -> None:
+    """Write ``step`` as an ONNX file, for any number of robots, with the ``conventions`` as plain data."""
     count = 2
     measured = [torch.zeros(count, size) for size in (NUM_JOINTS, NUM_JOINTS, 3, 3, MAP_SIZE)]
     memory = step.first_memory(count)
@@ -68,25 +74,34 @@ def export_step(step: ControlStep, space: CommandSpace, path: Path) -> None:
     assert program is not None
     model = program.model_proto
     first = {name: value[0].tolist() for name, value in memory.items()}
-    onnx.helper.set_model_props(model, {FIRST_MEMORY: json.dumps(first)})
+    onnx.helper.set_model_props(model, {FIRST_MEMORY: json.dumps(first), CONVENTIONS: json.dumps(conventions)})
+    model.ir_version = IR_VERSION
+    # The exporter writes down which line of which source file every node is from.
+    for part in (*model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
     atomic_write(path, lambda file: file.write(model.SerializeToString()))
 
 
 class OnnxStep:
-    """A control step in ONNX Runtime, called like :class:`ControlStep`."""
+    """A control step in ONNX Runtime, called like :class:`ControlStep`. It can be copied and pickled."""
 
-    def __init__(self, path: Path) -> None:
-        """Read the file; whatever ONNX Runtime raises is passed on.
+    def __init__(self, model: bytes) -> None:
+        """Take the contents of the file; whatever ONNX Runtime raises is passed on.
 
         Raises:
             KeyError: if the file does not say what its first memory is.
         """
+        self._model = model
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         first = json.loads(self._session.get_modelmeta().custom_metadata_map[FIRST_MEMORY])
         self._first = {name: torch.tensor(value) for name, value in first.items()}
         self._outputs = ["targets", "gate", *(f"next_{name}" for name in self._first)]
+
+    def __reduce__(self) -> tuple[type[OnnxStep], tuple[bytes]]:
+        return OnnxStep, (self._model,)
 
     @property
     def experts(self) -> int:

@@ -17,6 +17,7 @@ from lowlevel.commands import HEIGHT
 from lowlevel.control.controller import Controller
 from lowlevel.runs.checks import NonFiniteError
 from lowlevel.world.measures import Measurement
+from robots.errors import PilotError
 
 Make = Callable[..., CommandEnvironment]
 
@@ -83,6 +84,13 @@ def test_environments_that_are_given_one_controller_do_not_disturb_each_other(
         observed.append(first.step(action).observation)
         second.step(-action)
     torch.testing.assert_close(torch.stack(observed), torch.stack(expected), rtol=0, atol=0)
+
+
+def test_a_task_belongs_to_one_environment(untrained_controller: Path, coarse_physics: PhysicsConfig) -> None:
+    task = load_task("lift_box")
+    CommandEnvironment(task, untrained_controller, physics=coarse_physics)
+    with pytest.raises(PilotError, match="belongs to another environment already: make a task for each"):
+        CommandEnvironment(task, untrained_controller, physics=coarse_physics)
 
 
 def test_what_is_not_finite_is_refused(make_environment: Make, monkeypatch: pytest.MonkeyPatch) -> None:

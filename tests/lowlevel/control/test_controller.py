@@ -1,7 +1,9 @@
 """The frozen controller: golden vectors, ONNX parity, resets, and refusal of bad folders."""
 
 import json
+import pickle
 import shutil
+from copy import deepcopy
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +18,7 @@ from lowlevel.control.control_step import ControlStep
 from lowlevel.control.controller import (
     CONFIG_FILE,
     GOLDEN_FILE,
+    LOST_AFTER,
     ONNX_FILE,
     WEIGHTS_FILE,
     Controller,
@@ -24,7 +27,7 @@ from lowlevel.control.controller import (
     content_hash,
 )
 from lowlevel.control.golden import replay
-from lowlevel.control.onnx_step import FIRST_MEMORY, INPUTS
+from lowlevel.control.onnx_step import CONVENTIONS, FIRST_MEMORY, INPUTS
 from lowlevel.environment import EnvironmentConfig
 from lowlevel.export import export_controller
 from lowlevel.trainer import Trainer, TrainingConfig
@@ -63,8 +66,10 @@ def test_golden_vectors_replay(folder: Path, name: str | Path, runtime: Literal[
 def test_onnx_file_needs_nothing_of_this_package(folder: Path) -> None:
     """A port feeds measurements and what came out last, by name, for any number of robots."""
     session = onnxruntime.InferenceSession(folder / ONNX_FILE)
-    first = json.loads(session.get_modelmeta().custom_metadata_map[FIRST_MEMORY])
+    metadata = session.get_modelmeta().custom_metadata_map
+    first = json.loads(metadata[FIRST_MEMORY])
     assert len(first) <= 4
+    assert json.loads(metadata[CONVENTIONS]) == json.loads((folder / CONFIG_FILE).read_text())["config"]
     memory = {name: np.repeat(np.array([value], dtype=np.float32), 4, axis=0) for name, value in first.items()}
     names = [output.name for output in session.get_outputs()]
     for step in golden_steps(folder):
@@ -72,6 +77,12 @@ def test_onnx_file_needs_nothing_of_this_package(folder: Path) -> None:
         outputs = dict(zip(names, session.run(names, measured | memory), strict=True))
         np.testing.assert_allclose(outputs["targets"], step["targets"], atol=1e-5)
         memory = {name: outputs[f"next_{name}"] for name in memory}
+
+
+def test_the_onnx_file_can_be_read_by_last_years_runtimes_and_names_no_source_files(folder: Path) -> None:
+    assert onnx.load(folder / ONNX_FILE).ir_version <= 10
+    content = (folder / ONNX_FILE).read_bytes()
+    assert b".py" not in content and str(Path.cwd()).encode() not in content
 
 
 def test_a_controller_without_weights_runs_in_onnx_runtime_alone(folder: Path, tmp_path: Path) -> None:
@@ -129,6 +140,67 @@ def test_resetting_one_robot_forgets_only_that_robot(folder: Path) -> None:
     assert torch.equal(after[2], first[2])
     assert torch.equal(after[[0, 1, 3]], continued[[0, 1, 3]])
     assert not torch.equal(after[0], first[0])
+
+
+@pytest.mark.parametrize("runtime", ["onnx", "torch"])
+@pytest.mark.parametrize("name", INPUTS)
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_sample_that_is_not_finite_holds_the_targets_and_is_forgotten(
+    folder: Path, runtime: Literal["onnx", "torch"], name: str, bad: float
+) -> None:
+    controller, spared = (Controller.load(folder, runtime=runtime) for _ in range(2))
+    first, second, third = golden_steps(folder)
+    controller.reset(4)
+    spared.reset(4)
+    before = replay(controller, first)
+    replay(spared, first)
+    spoiled = {key: value.clone() for key, value in second.items()}
+    spoiled[name][1, 0] = bad
+    held, others = replay(controller, spoiled), replay(spared, second)
+    assert torch.equal(held[1], before[1])
+    assert torch.equal(held[[0, 2, 3]], others[[0, 2, 3]])
+    assert controller.holds.tolist() == [False, True, False, False]
+    spared.reset(4)
+    replay(spared, first)
+    assert torch.equal(replay(controller, third)[1], replay(spared, third)[1])
+    assert not controller.holds.any()
+
+
+def test_a_robot_without_usable_samples_is_lost_after_a_while_and_begins_at_the_default_pose(folder: Path) -> None:
+    controller = Controller.load(folder)
+    controller.reset(4)
+    good = golden_steps(folder)[0]
+    bad = good | {"joint_position": good["joint_position"].clone()}
+    bad["joint_position"][2] = float("nan")
+    for _ in range(LOST_AFTER - 1):
+        targets = replay(controller, bad)
+        assert not controller.lost.any()
+    assert torch.equal(targets[2], torch.tensor(controller.config.default_position))
+    replay(controller, bad)
+    assert controller.lost.tolist() == [False, False, True, False]
+    controller.reset(4, torch.tensor([2]))
+    assert not controller.lost.any()
+
+
+@pytest.mark.parametrize("runtime", ["onnx", "torch"])
+def test_inference_mode_may_begin_and_end_between_two_steps(folder: Path, runtime: Literal["onnx", "torch"]) -> None:
+    controller = Controller.load(folder, runtime=runtime)
+    first, second, _ = golden_steps(folder)
+    with torch.inference_mode():
+        controller.reset(4)
+        replay(controller, first)
+    controller.reset(4, torch.tensor([0]))
+    replay(controller, second)
+
+
+def test_a_controller_can_be_copied_and_pickled_with_what_it_remembers(folder: Path) -> None:
+    controller = Controller.load(folder)
+    controller.reset(4)
+    first, second, _ = golden_steps(folder)
+    replay(controller, first)
+    copies = deepcopy(controller), pickle.loads(pickle.dumps(controller))
+    targets = replay(controller, second)
+    assert all(torch.equal(replay(other, second), targets) for other in copies)
 
 
 def test_acting_leaves_no_gradient_and_no_changed_weight(folder: Path) -> None:
