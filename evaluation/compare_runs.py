@@ -17,7 +17,7 @@ from lowlevel.runs.run_folder import LOG_FILE
 from robots.errors import PilotError
 
 PANELS = {
-    "episode/steps_between_falls": "steps between falls",
+    "curriculum/steps_between_falls": "steps between falls",
     "reward/total": "reward [1/s]",
     "tracking/E_v": "E_v [m/s]",
     "tracking/E_omega": "E_omega [rad/s]",

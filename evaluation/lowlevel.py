@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +36,6 @@ from evaluation.reporting.reports import (
     write_results,
 )
 from evaluation.tracking_report import Evaluation, Measured, summary, write_report
-from lowlevel.control.controller import Controller, add_metrics
 from lowlevel.control.whole_body import Supports, WholeBodyController
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.progress import ProgressReport
@@ -79,8 +78,6 @@ class Arguments:
     """Physics threads."""
     record: int = 0
     """Also record this many of the first episodes for the rerun viewer."""
-    write_metrics: bool = False
-    """Also store the figures in the controller's own folder."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -100,15 +97,9 @@ def _run(arguments: Arguments) -> None:
         raise PilotError("--record must be between 0 and the number of episodes and of robots")
     suite_of(arguments.suite)
     condition_of(arguments.condition)
-    if arguments.write_metrics and (arguments.condition != "nominal" or arguments.robot is not None):
-        raise PilotError("--write-metrics is for figures of our robot under the nominal condition: leave it out")
     check_output(arguments.output)
     name, controller = load_controller(arguments.controller)
-    if arguments.write_metrics and not isinstance(controller, Controller):
-        raise PilotError(f"--write-metrics stores figures in a controller's folder, and {arguments.controller} is none")
     others = load_controllers(arguments.against)
-    if arguments.write_metrics and not common_supports([controller, *others.values()]).covers(controller.supports):
-        raise PilotError("--write-metrics is for figures of all commands, and these controllers share only some")
     # Small matrix products only lose time to waking threads, and the physics wants the cores.
     torch.set_num_threads(1)
     print(f"evaluating {arguments.controller} on the {arguments.suite} suite", flush=True)
@@ -125,11 +116,6 @@ def _run(arguments: Arguments) -> None:
             _record(controller, arguments, folder, evaluation.supports)
 
     write_results(arguments.output, write)
-    if arguments.write_metrics and isinstance(controller, Controller):
-        stored = controller.provenance.get("metrics", {})
-        figures = {name: asdict(figure) for name, figure in evaluation.ours.figures.items()}
-        entry = {"seed": arguments.seed, "figures": figures}
-        add_metrics(arguments.controller, stored | {arguments.suite: entry})
     print(summary(evaluation))
     print(f"report: {arguments.output / REPORT_FILE}   figures: {arguments.output / METRICS_FILE}")
 

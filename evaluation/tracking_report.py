@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.protocols import crossing, tracking
-from evaluation.protocols.skills import BARS, SKILLS, UNLOADED_BEND
+from evaluation.protocols.skills import SKILL_FIGURES, SKILLS, UNLOADED_BEND
 from evaluation.protocols.suites import Suite
 from evaluation.protocols.tracking import COMPARED, FIGURES, GROUPS, CommandTable, paired_differences
 from evaluation.reporting.plots import plot_bars, plot_curves, plot_heat_map, plot_overlays, plot_scatter
@@ -132,7 +132,7 @@ def report_text(evaluation: Evaluation, strips: Mapping[str, str]) -> str:
         by_group_steady=_breakdown(figures, groups, "_steady"),
         by_tile=_breakdown(figures, {tile: f"_on_{tile}" for tile in evaluation.suite.terrain.tiles}),
         skills=[skill for skill in SKILLS if skill is not UNLOADED_BEND] if has_skills else [],
-        bars=BARS,
+        skill_figures=SKILL_FIGURES,
     )
 
 

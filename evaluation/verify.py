@@ -125,7 +125,7 @@ def told_speeds(controller: WholeBodyController) -> dict[str, float]:
 def deviations(measured: dict[str, float], stated: dict[str, float]) -> list[str]:
     """Tests whose results differ from what is ``stated`` by more than TOLERANCE, in words."""
     return [
-        f"{name}: {measured[name]:.3f} instead of {value:.3f} {TESTS[name].unit}"
+        f"{name}: {measured[name]:.3f} instead of {value:.3f} {TESTS[name].unit}".removesuffix(" 1")
         for name, value in stated.items()
         if abs(measured[name] - value) > TOLERANCE
     ]

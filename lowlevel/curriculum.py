@@ -17,9 +17,6 @@ from lowlevel.commands import KINDS
 from lowlevel.runs.distributed import sum_over_ranks
 from lowlevel.world.terrain import TILES
 
-QUALITY_TERMS = ("linear_velocity", "angular_velocity", "base_height", "torso_orientation")
-"""Reward terms in [0, 1] whose mean is the quality of tracking."""
-
 FIRST_FALL_RATE = 0.05
 """What is assumed of a kind before it was seen [falls per control step]."""
 
@@ -33,7 +30,8 @@ class CurriculumConfig:
     growth: float = 0.006
     """Growth of an opening per update."""
     quality: float = 0.35
-    """Quality of tracking above which a kind may grow, under the noise of exploration."""
+    """Quality of tracking (:func:`lowlevel.rewards.tracking_quality`) above which a kind may grow, under the noise of
+    exploration."""
     steps_between_falls: float = 300.0
     """Control steps of a kind per fall above which it may grow; below half as many it shrinks. Where every robot falls
     no action is better than another, and nothing is learned."""
@@ -104,14 +102,13 @@ class Curriculum:
         self.hardness = torch.zeros(())
         """How hard the conditions are, in [0, 1], in stages that make them harder."""
 
-    def observe(self, kind: Tensor, tile: Tensor, terms: dict[str, Tensor], fallen: Tensor) -> None:
-        """Count one step of N robots: their kinds of command and tile (N,), unweighted reward ``terms``, falls (N,)."""
-        quality = torch.stack([terms[name] for name in QUALITY_TERMS]).mean(dim=0)
+    def observe(self, kind: Tensor, tile: Tensor, quality: Tensor, fallen: Tensor) -> None:
+        """Count one step of N robots: kinds of command and tile, quality of tracking, and who fell, (N,) each."""
         self.kinds.observe(kind, quality, fallen)
         self.tiles.observe(tile, quality, fallen)
 
     def introduce(self, kinds: Tensor) -> None:
-        """Open ``kinds`` (kinds,) bool anew, as at the start: robots that were not told them forget them."""
+        """Open ``kinds`` (kinds,) bool anew, as at the start: a policy forgets commands that it no longer sees."""
         self.opening[kinds] = self.config.start
         self.kinds.forget(kinds)
 
@@ -142,7 +139,8 @@ class Curriculum:
 
     def figures(self, kind_shares: Tensor, tile_shares: Tensor) -> dict[str, float]:
         """Hardness, and openings, qualities and falls of the kinds that are drawn, by name."""
-        result = {"hardness": float(self.hardness)}
+        falls = (self.kind_chances(kind_shares) * self.kinds.fall_rate).sum().clamp_min(1e-6)
+        result = {"hardness": float(self.hardness), "steps_between_falls": float(1.0 / falls)}
         opened = zip(KINDS, self.opening.tolist(), kind_shares.tolist(), strict=True)
         result |= {f"opening/{name}": opening for name, opening, share in opened if share > 0.0}
         return result | self.kinds.figures(KINDS, kind_shares) | self.tiles.figures(TILES, tile_shares)

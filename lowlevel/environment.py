@@ -33,7 +33,7 @@ from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceStat
 from lowlevel.control.stepping import swing_first
 from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
 from lowlevel.levels import Levels
-from lowlevel.rewards import RewardWeights, Transition, compute_rewards
+from lowlevel.rewards import RewardWeights, Transition, compute_rewards, tracking_quality
 from lowlevel.world.measures import Measurement, is_lost, velocity_error, with_rows
 from lowlevel.world.privileged import PRIVILEGED, PrivilegedView
 from lowlevel.world.randomization import RandomizationConfig, Randomizer
@@ -100,6 +100,8 @@ class StepResult:
     """Privileged observation before resets: the true successor state."""
     terms: dict[str, Tensor]
     """Unweighted reward terms."""
+    quality: Tensor
+    """Quality of tracking (N,), in [0, 1]."""
     measured: Measurement
     """Before resets."""
     command: Tensor
@@ -208,6 +210,7 @@ class PilotEnvironment:
             fallen=fallen,
         )
         reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
+        quality = tracking_quality(transition)
         command, kind, tile_kind = buffers.command, buffers.kind.clone(), buffers.tile_kind.clone()
         # The frozen controller goes by the policy's estimate of the capture point.
         buffers.reference = self.reference.begin_step(buffers.reference, swing_first(measured.capture_point))
@@ -231,6 +234,7 @@ class PilotEnvironment:
             truncated=truncated,
             next_privileged=next_privileged,
             terms=terms,
+            quality=quality,
             measured=measured,
             command=command,
             kind=kind,

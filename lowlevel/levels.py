@@ -21,6 +21,7 @@ class Levels:
 
     def __init__(self, terrain: Terrain, num_robots: int, device: torch.device | str = "cpu") -> None:
         self._terrain = terrain
+        self._config = terrain.config
         self._count = len(terrain.config.levels)
         self._row = {kind: row for row, kind in enumerate(terrain.config.tiles)}
         self.reached = torch.zeros(num_robots, len(TILES), dtype=torch.long, device=device)
@@ -32,7 +33,7 @@ class Levels:
         """
         kinds = torch.multinomial(chances, len(ids), replacement=True, generator=generator)
         rows = torch.tensor([self._row.get(kind, 0) for kind in TILES], device=ids.device)
-        return kinds, rows[kinds] * self._count + self.reached[ids, kinds]
+        return kinds, self._config.number_of(rows[kinds], self.reached[ids, kinds])
 
     def judge(
         self,
@@ -47,8 +48,8 @@ class Levels:
         """Move robots ``ids`` (n,) up after a success on a ``kind`` of tile, and down after a fall.
 
         ``tile`` (n,) as in :meth:`draw`; ``error`` (n,), mean velocity error over the episode [m/s]; ``climbed`` (n,),
-        changes of the ground's height below the base, up and down together [m]. Who has mastered the last level goes on
-        at any.
+        changes of the ground's height below the base, up and down together [m]. Robots past the last level go on at a
+        random one.
         """
         crossed = climbed >= CROSSED * self._terrain.relief[tile]
         success = ~fallen & (error < LARGEST_ERROR) & crossed

@@ -1,4 +1,4 @@
-"""Named training configurations. A preset is the default configuration with a few fields replaced."""
+"""The stages of a training as data, and named configurations made of them."""
 
 from __future__ import annotations
 

@@ -302,6 +302,15 @@ REWARD_TERMS: dict[str, Callable[[Transition], Tensor]] = {
 """Terms by name."""
 
 
+QUALITY_TERMS = (linear_velocity, angular_velocity, base_height, torso_orientation)
+"""Tracking of velocity, height and attitude as kernels in [0, 1], whatever they weigh in the reward."""
+
+
+def tracking_quality(transition: Transition) -> Tensor:
+    """Quality of tracking in [0, 1] (N,), by which commands open."""
+    return torch.stack([term(transition) for term in QUALITY_TERMS]).mean(dim=0)
+
+
 def compute_rewards(
     transition: Transition, weights: RewardWeights, control_period: float
 ) -> tuple[Tensor, dict[str, Tensor]]:

@@ -91,6 +91,8 @@ def _defaults(arguments: list[str]) -> Arguments:
 
 
 def _fresh(parsed: Arguments, device: torch.device) -> Trainer:
+    if parsed.config.network.vision and parsed.blind is None:
+        raise PilotError("networks that see begin with those of a blind run: name its folder with --blind")
     folder = parsed.output / (parsed.name or f"{parsed.preset}-{time.strftime('%Y%m%d-%H%M%S')}")
     if distributed.rank() == 0:  # other ranks may come when this one has made the folder
         RunFolder(folder).require_unused()

@@ -118,7 +118,6 @@ class Trainer:
         )
         self.steps = 0
         self.trained_seconds = 0.0
-        self.fall_rate = 0.05
         self.observation: dict[str, Tensor] = {}
         self._stop_requested = False
         self._begin_stage(0)
@@ -217,7 +216,7 @@ class Trainer:
 
     def iterate(self) -> dict[str, float]:
         """One rollout and one update; returns figures to log."""
-        terms, tracking, falls = Averages(), Averages(), Averages()
+        terms, tracking = Averages(), Averages()
         started = time.monotonic()
         for _ in range(self.ppo.storage.steps):
             action = self.ppo.act(self.observation)
@@ -226,19 +225,14 @@ class Trainer:
             interrupted = result.truncated | result.surprised
             self.ppo.record(result.reward, result.terminated, interrupted, result.next_privileged, result.kind)
             self.observation = result.observation
-            self.curriculum.observe(result.kind, result.tile_kind, result.terms, result.terminated)
+            self.curriculum.observe(result.kind, result.tile_kind, result.quality, result.terminated)
             terms.add(result.terms | {"total": result.reward / self.environment.control_period})
-            falls.add({"share": result.terminated})
             tracking.add(_tracking(result))
         collection_seconds = time.monotonic() - started
         losses = self.ppo.update(self.observation)
         self.steps += self._steps_per_iteration
 
         mean_terms = terms.take()
-        fallen = falls.take()["share"]
-        self.fall_rate += 0.1 * (fallen - self.fall_rate)
-        # No more than were taken: a run that has not fallen yet does not stand for ever.
-        steps_between_falls = 1.0 / max(self.fall_rate, 1.0 / self.steps)
         self.curriculum.update(hardens=self.stage.harder is not None)
         self._apply_curriculum()
         figures = {f"reward/{name}": value for name, value in mean_terms.items()}
@@ -247,7 +241,6 @@ class Trainer:
         figures |= {f"curriculum/{name}": value for name, value in curriculum.items()}
         figures["curriculum/stage"] = float(self.stage_number)
         figures |= {f"learner/{name}": value for name, value in losses.items()}
-        figures["episode/steps_between_falls"] = steps_between_falls
         figures["speed/collection_seconds"] = collection_seconds
         return figures
 
@@ -262,7 +255,6 @@ class Trainer:
             "observation": self.observation,
             "steps": self.steps,
             "trained_seconds": self.trained_seconds,
-            "fall_rate": self.fall_rate,
             "action_scale": self.environment.action_scale.cpu(),
             "stage": self.stage_number,
             "stage_begin": self.stage_begin,
@@ -302,7 +294,6 @@ class Trainer:
                 f"the state in {self.run.path} is of another version: its curriculum has no {error}"
             ) from error
         self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
-        self.fall_rate = float(state["fall_rate"])
         self._begin_stage(int(state["stage"]))
         self.stage_begin, self.waited_for = int(state["stage_begin"]), float(state["waited_for"])
         if with_environment and rank() == 0 and "environment" in state:
@@ -330,7 +321,7 @@ class Trainer:
         stage = self.stage
         waits = f" until {stage.waits_for} {self.waited_for:.2f} > {stage.above:g}" if stage.waits_for else ""
         return (
-            f"{stage.name}{waits}  falls every {figures['episode/steps_between_falls']:.0f} steps"
+            f"{stage.name}{waits}  falls every {figures['curriculum/steps_between_falls']:.0f} steps"
             f"  E_v {figures['tracking/E_v']:.2f}  {figures['speed/steps_per_second']:.0f} steps/s"
         )
 

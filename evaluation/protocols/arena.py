@@ -8,7 +8,7 @@ there until its next command begins, and is stood up for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +37,16 @@ STEERING, MOST_STEERING = 1.0, 0.5
 JOINT_SPREAD = 0.02
 """Largest deviation of a joint from the standing pose at the start [rad]."""
 _PROPRIOCEPTION_SIZE = 2 * NUM_JOINTS + 6
+_NOT_DRAWN = (
+    "joint_offset",
+    "hand_load_probability",
+    "start_velocity",
+    "push_velocity",
+    "map_offset",
+    "map_drift",
+    "map_delay",
+)
+"""Randomization of training that episodes have no part in."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +117,6 @@ class Moment:
     """The clamped command that the step tracked (N, 21)."""
     flag: Tensor
     """(N, 1)"""
-    since_change: Tensor
-    """Time from the command's begin to the end of the step (N,) [s]."""
     elevation: Tensor
     """The noisy elevation map that the controller saw (N, 121) [m]."""
     gate: Tensor
@@ -155,7 +163,8 @@ class Arena:
     Args:
         controller: on the CPU; its memory is reset by every batch.
         terrain: tiles to start on.
-        conditions: friction, latency, gains and torque limits; the protocol's by default.
+        conditions: friction, masses, gains, torque limits and latency; the protocol's by default. Pushes and loads are
+            those of an episode.
         noise: observation noise.
         num_threads: physics threads.
         batch: robots simulated side by side (N).
@@ -184,7 +193,11 @@ class Arena:
         self.supports = controller.supports if supports is None else supports
         self._neutral = self.supports.cut(self.space.neutral()[None])
         self.experts = controller.experts if isinstance(controller, HasExperts) else 0
-        drawn = RandomizationConfig.for_evaluation() if conditions is None else conditions
+        protocol = RandomizationConfig.for_evaluation()
+        drawn = protocol if conditions is None else conditions
+        for name in _NOT_DRAWN:
+            if getattr(drawn, name) != getattr(protocol, name):
+                raise ValueError(f"an arena does not draw {name!r}: leave it as it is in the protocol")
         self._randomizer = Randomizer(drawn, self.simulation, torch.Generator())
         self._proprioception_noise = noise.proprioception()
         self._elevation_noise = noise.elevation
@@ -253,7 +266,6 @@ class Arena:
                 targets=targets,
                 command=command,
                 flag=flag,
-                since_change=(step + 1 - starts[rows, current]) * self.period,
                 elevation=elevation.clone(),
                 gate=self._gate(),
                 work=work,
@@ -357,32 +369,6 @@ class Arena:
         self.simulation.restart(ids)
         joints = self.world.stand(ids, xy, heading, neutral, joint_spread)
         self._randomizer.start(ids, joints)
-
-
-def run_all(
-    arena: Arena,
-    episodes: Sequence[Episode],
-    observe: Callable[[int, Sequence[Episode]], Callable[[Moment], None]],
-    advance: Callable[[int], None] = lambda steps: None,
-) -> None:
-    """Run any number of episodes, a batch at a time.
-
-    Args:
-        arena: where.
-        episodes: what.
-        observe: called with the index of a batch's first episode and its episodes; returns what is given
-            every moment.
-        advance: told how many control steps of a batch have passed, for a progress bar.
-    """
-    for first in range(0, len(episodes), arena.batch):
-        batch = episodes[first : first + arena.batch]
-        see = observe(first, batch)
-        steps = 0
-        for moment in arena.run(batch):
-            see(moment)
-            advance(1)
-            steps += 1
-        advance(batch_steps(arena, batch) - steps)
 
 
 def batch_steps(arena: Arena, episodes: Sequence[Episode]) -> int:

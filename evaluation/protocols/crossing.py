@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from evaluation.protocols.arena import Arena, Course, Episode
 from evaluation.protocols.trace import Channel, Trace, record
@@ -78,8 +79,8 @@ def run_crossing(
     trace = record(arena, episodes, CHANNELS | _PLACE, advance)
     middle = arena.world.terrain.tile_centers[[episode.tile for episode in episodes], 0].numpy()
     place = trace["place"] - middle[:, None]
-    tile = np.array([episode.tile for episode in episodes])
-    table, transient = tabulate(until(trace, reached(place, _FAR_SIDE)), episodes, len(LEVELS))
+    tile = torch.tensor([episode.tile for episode in episodes])
+    table, transient = tabulate(until(trace, reached(place, _FAR_SIDE)), episodes, TERRAIN)
     return table, transient, crossing_figures(place, trace.fell | trace.failed, tile)
 
 
@@ -97,7 +98,7 @@ def until(trace: Trace, over: np.ndarray) -> Trace:
     return replace(trace, channels=channels, fell=trace.fell & ~over, failed=trace.failed & ~over)
 
 
-def crossing_figures(place: np.ndarray, out: np.ndarray, tile: np.ndarray) -> dict[str, Figure]:
+def crossing_figures(place: np.ndarray, out: np.ndarray, tile: Tensor) -> dict[str, Figure]:
     """Shares that cross without a fall, by kind of tile and level: ``crosses_stairs_15.0 cm`` and so on.
 
     ``place`` (E, T) along the course from the middle of the tile [m]; ``out`` (E, T), falls; ``tile`` (E,) as in
@@ -107,11 +108,12 @@ def crossing_figures(place: np.ndarray, out: np.ndarray, tile: np.ndarray) -> di
     fallen = np.logical_or.accumulate(out, axis=1)
     across = np.asarray((reached(place, _FAR_SIDE) & ~fallen).any(axis=1))
     up = np.asarray((reached(place, _TOP) & ~fallen).any(axis=1))
-    kinds, levels = tile // len(LEVELS), tile % len(LEVELS)
-    figures = {"crosses": share_figure(across), "crosses_flat": share_figure(across[kinds == 0])}
-    for number, kind in enumerate(OBSTACLES, start=1):
+    kinds, levels = (place.numpy() for place in TERRAIN.place_of(tile))
+    of_kind = {kind: kinds == number for number, kind in enumerate(TERRAIN.tiles)}
+    figures = {"crosses": share_figure(across), "crosses_flat": share_figure(across[of_kind["flat"]])}
+    for kind in OBSTACLES:
         for level, name in enumerate(level_names(kind)):
-            rows = (kinds == number) & (levels == level)
+            rows = of_kind[kind] & (levels == level)
             figures[f"crosses_{name}"] = share_figure(across[rows])
             if kind in TWO_WAYS:
                 figures[f"climbs_{name}"] = share_figure(up[rows])

@@ -253,39 +253,22 @@ def drift(trace: Trace, begin: float, end: float) -> tuple[np.ndarray, np.ndarra
 # -- report --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Bar:
-    """What a controller should reach."""
-
-    limit: float
-    at_most: bool = False
-
-    def __str__(self) -> str:
-        return f"{'≤' if self.at_most else '≥'} {self.limit:.2f}"
-
-    def is_met(self, figure: Figure) -> bool:
-        """By the figure's value; a figure without one meets nothing."""
-        if figure.value is None:
-            return False
-        return figure.value <= self.limit if self.at_most else figure.value >= self.limit
-
-
-BARS: dict[str, Bar | None] = {
-    "deep_bend_success": Bar(1.0),
-    "deep_bend_height_error": Bar(0.03, at_most=True),
-    "deep_bend_pitch_error": Bar(0.10, at_most=True),
-    "loaded_bend_success": Bar(1.0),
-    "loaded_bend_height_error": None,
-    "loaded_bend_pitch_error": None,
-    "loaded_bend_palm_displacement": None,
-    "loaded_walk_success": Bar(1.0),
-    "loaded_walk_speed": None,
-    "fast_walk_success": None,
-    "fast_walk_speed": Bar(0.90),
-    "stop_success": None,
-    "stop_rest": Bar(1.0),
-    "stop_drift": Bar(LARGEST_DRIFT, at_most=True),
-    "stop_turn": None,
-    "push_success": Bar(0.9),
-}
-"""Rows of the report's table and the bar of each."""
+SKILL_FIGURES = (
+    "deep_bend_success",
+    "deep_bend_height_error",
+    "deep_bend_pitch_error",
+    "loaded_bend_success",
+    "loaded_bend_height_error",
+    "loaded_bend_pitch_error",
+    "loaded_bend_palm_displacement",
+    "loaded_walk_success",
+    "loaded_walk_speed",
+    "fast_walk_success",
+    "fast_walk_speed",
+    "stop_success",
+    "stop_rest",
+    "stop_drift",
+    "stop_turn",
+    "push_success",
+)
+"""Rows of the report's table."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from evaluation.protocols.arena import Arena, Episode, Moment, run_all
+from evaluation.protocols.arena import Arena, Episode, Moment
 
 
 @dataclass(frozen=True)
@@ -53,22 +53,24 @@ def record(
     channels: Mapping[str, Channel],
     advance: Callable[[int], None] = lambda steps: None,
 ) -> Trace:
-    """Run ``episodes``, all of the same duration, and keep ``channels`` of them."""
+    """Run ``episodes``, all of the same duration, a batch at a time, and keep ``channels`` of them.
+
+    ``advance`` is told how many control steps of a batch have passed, for a progress bar.
+    """
     count, length = len(episodes), round(episodes[0].duration / arena.period)
     arrays = {name: np.full((count, length, *channel.shape), np.nan, np.float32) for name, channel in channels.items()}
     fell, failed = np.zeros((2, count, length), dtype=bool)
-
-    def observe(first: int, batch: Sequence[Episode]) -> Callable[[Moment], None]:
-        def add(moment: Moment) -> None:
+    for first in range(0, count, arena.batch):
+        batch, steps = episodes[first : first + arena.batch], 0
+        for moment in arena.run(batch):
             (rows,) = moment.active[: len(batch)].numpy().nonzero()
             for name, channel in channels.items():
                 arrays[name][first + rows, moment.step] = channel.read(moment).numpy()[rows]
             fell[first + rows, moment.step] = moment.fell.numpy()[rows]
             failed[first + rows, moment.step] = moment.failed.numpy()[rows]
-
-        return add
-
-    run_all(arena, episodes, observe, advance)
+            steps += 1
+            advance(1)
+        advance(length - steps)
     return Trace(arena.period, arrays, fell, failed)
 
 

@@ -34,6 +34,7 @@ from lowlevel.commands import (
     shares,
 )
 from lowlevel.world.measures import TRACKING_FIGURES, velocity_error
+from lowlevel.world.terrain import TerrainConfig
 
 EPISODE_LENGTH = 20.0
 """[s]"""
@@ -78,9 +79,9 @@ def protocol_episodes(
 
 
 def group_of(command: Tensor, flag: Tensor) -> Tensor:
-    """Index into :data:`GROUPS` (N,) of commands (N, 21) with flags (N, 1)."""
+    """Index into :data:`GROUPS` (N,) of commands (N, 21) with flags (N,), as they are drawn and before they are cut."""
     works = torch.where(is_walking(command), 0, 1)
-    return torch.where(flag[:, 0] > 0.5, works, 2)
+    return torch.where(flag > 0.5, works, 2)
 
 
 FIGURES: dict[str, str] = {name: unit for name, (unit, _) in TRACKING_FIGURES.items()} | {
@@ -107,8 +108,6 @@ CHANNELS: dict[str, Channel] = {
     "travel_speed": Channel(travel_speed),
     "work": Channel(lambda moment: moment.work),
     "targets": Channel(lambda moment: moment.targets, (29,)),
-    "group": Channel(lambda moment: group_of(moment.command, moment.flag).float()),
-    "flag": Channel(lambda moment: moment.flag[:, 0]),
 }
 
 
@@ -154,20 +153,23 @@ def run_tracking(
     Returns:
         the table of their commands, and the mean figures over the time since a command began (steps, figures).
     """
-    return tabulate(record(arena, episodes, CHANNELS, advance), episodes, len(arena.world.terrain.config.levels))
+    return tabulate(record(arena, episodes, CHANNELS, advance), episodes, arena.world.terrain.config)
 
 
-def tabulate(trace: Trace, episodes: Sequence[Episode], levels: int) -> tuple[CommandTable, np.ndarray]:
-    """What :func:`run_tracking` returns, from a ``trace`` with its channels; tiles come in as many ``levels``."""
+def tabulate(trace: Trace, episodes: Sequence[Episode], terrain: TerrainConfig) -> tuple[CommandTable, np.ndarray]:
+    """What :func:`run_tracking` returns, from a ``trace`` with its channels on a ``terrain``."""
     starts = [round(start / trace.period) for start in episodes[0].starts]
     ends = [*starts[1:], trace.fell.shape[1]]
     spans = [slice(start, end) for start, end in zip(starts, ends, strict=True)]
     parts = [command_columns(trace, span) for span in spans]
-    tiles = np.array([episode.tile // levels for episode in episodes])
+    tiles = terrain.place_of(torch.tensor([episode.tile for episode in episodes]))[0].numpy()
+    flags = torch.cat([episode.flags for episode in episodes])
+    group = group_of(torch.cat([episode.commands for episode in episodes]), flags).numpy()
     # An episode's commands follow one another.
     columns = {name: np.stack([part[name] for part in parts], axis=1).reshape(-1) for name in parts[0]}
+    for name in ("E_arm", "E_arm_steady"):
+        columns[name][flags.numpy() < 0.5] = np.nan
     count = len(spans)
-    group = columns.pop("group").astype(int)
     table = CommandTable(np.repeat(np.arange(len(episodes)), count), np.repeat(tiles, count), group, columns)
     errors = np.stack([trace[name] for name in TRACKING_FIGURES], axis=-1)
     length = min(span.stop - span.start for span in spans)
@@ -176,7 +178,7 @@ def tabulate(trace: Trace, episodes: Sequence[Episode], levels: int) -> tuple[Co
 
 
 def command_columns(trace: Trace, span: slice) -> dict[str, np.ndarray]:
-    """Columns of a :class:`CommandTable`, and "group", for the command that is told during ``span``; all (E,)."""
+    """Columns of a :class:`CommandTable` for the command that is told during ``span``; all (E,)."""
     steady = slice(min(span.start + round(TRANSIENT / trace.period), span.stop), span.stop)
     columns: dict[str, np.ndarray] = {}
     for suffix, steps in (("", span), ("_steady", steady)):
@@ -185,14 +187,12 @@ def command_columns(trace: Trace, span: slice) -> dict[str, np.ndarray]:
         averaged = window_means(trace["velocity_error"][:, steps], round(AVERAGING / trace.period))
         columns[f"E_v_mean{suffix}"] = time_mean(np.abs(averaged[..., :2]).sum(axis=-1))
         columns[f"E_omega_mean{suffix}"] = time_mean(np.abs(averaged[..., 2]))
-        columns[f"E_arm{suffix}"] = np.where(trace["flag"][:, span.start] > 0.5, columns[f"E_arm{suffix}"], np.nan)
     columns["fell"] = trace.fell[:, span].any(axis=1).astype(float)
     columns["failed"] = trace.failed[:, span].any(axis=1).astype(float)
     speed = trace["travel_speed"][:, span]
     columns["energy"] = np.nansum(np.where(np.isnan(speed), np.nan, trace["work"][:, span]), axis=1, dtype=float)
     columns["progress"] = np.nansum(speed, axis=1, dtype=float) * trace.period
     columns["action_rate"] = time_mean(np.abs(np.diff(trace["targets"][:, span], axis=1)).mean(axis=-1))
-    columns["group"] = trace["group"][:, span.start]
     return columns
 
 

@@ -367,11 +367,6 @@ def content_hash(folder: Path | str) -> str:
     return _FOLDER.identity(Path(folder))
 
 
-def add_metrics(folder: Path | str, metrics: dict[str, Any]) -> None:
-    """Write measured figures into ``controller.json``; the identity does not change."""
-    _FOLDER.add_provenance(Path(folder), metrics=metrics)
-
-
 def _read_onnx(folder: Path, device: torch.device | str) -> OnnxStep:
     if torch.device(device).type != "cpu":
         raise ControllerError(f"the runtime 'onnx' computes on the CPU, not on {device}: use the runtime 'torch'")

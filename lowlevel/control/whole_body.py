@@ -23,10 +23,6 @@ class Bounds:
     def __and__(self, other: Bounds) -> Bounds:
         return Bounds(torch.maximum(self.lower, other.lower), torch.minimum(self.upper, other.upper))
 
-    def covers(self, other: Bounds) -> bool:
-        """Whether ``other`` lies within."""
-        return bool((self.lower <= other.lower).all() and (self.upper >= other.upper).all())
-
 
 @dataclass(frozen=True)
 class Supports:
@@ -45,10 +41,6 @@ class Supports:
 
     def __and__(self, other: Supports) -> Supports:
         return Supports(self.standing & other.standing, self.walking & other.walking)
-
-    def covers(self, other: Supports) -> bool:
-        """Whether whatever ``other`` can be told is among these."""
-        return self.standing.covers(other.standing) and self.walking.covers(other.walking)
 
 
 class WholeBodyController(Protocol):

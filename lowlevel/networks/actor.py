@@ -180,7 +180,7 @@ class PilotActor(nn.Module):
         current = self.normalizer(frame)
         inputs = [latent.detach(), motion.detach(), current, flag]
         if self.config.vision:
-            inputs.insert(0, self.map_encoder(self._heights(elevation_map), current))
+            inputs.append(self.map_encoder(self._heights(elevation_map), current))
         return self.head(torch.cat(inputs, dim=1))
 
     def forward(self, history: Tensor, elevation_map: Tensor, flag: Tensor) -> ActorOutput:

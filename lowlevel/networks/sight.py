@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from robots.errors import PilotError
 
-_MAP_COMES_FIRST = ("head.",)
-"""Parameters whose new inputs stand before those that were there; everywhere else they stand behind them."""
+_MAP_ENCODER = "map_encoder."
+"""Prefix of what a blind policy does not use and has never trained."""
 
 
 @torch.no_grad()
@@ -24,12 +24,15 @@ def give_sight(network: nn.Module, blind: Mapping[str, Tensor]) -> None:
         PilotError: if these are not the weights of such a network.
     """
     state = network.state_dict()
-    unfitting = state.keys() ^ blind.keys()
+    given, wanted = (
+        {name: weight for name, weight in weights.items() if not name.startswith(_MAP_ENCODER)}
+        for weights in (blind, state)
+    )
+    unfitting = wanted.keys() ^ given.keys()
     if unfitting:
         raise PilotError(f"a network cannot begin with the weights of another architecture: {min(unfitting)!r}")
-    for name, weight in state.items():
-        weight.copy_(_widened(name, blind[name].to(weight.device), weight))
-    network.load_state_dict(state)
+    widened = {name: _widened(name, given[name].to(weight.device), weight) for name, weight in wanted.items()}
+    network.load_state_dict(state | widened)
 
 
 def _widened(name: str, old: Tensor, new: Tensor) -> Tensor:
@@ -40,7 +43,5 @@ def _widened(name: str, old: Tensor, new: Tensor) -> Tensor:
         shapes = f"{tuple(old.shape)} and {tuple(new.shape)}"
         raise PilotError(f"a network cannot begin with the weights of another architecture: {name!r} has {shapes}")
     wide = torch.zeros_like(new) if new.dim() > 1 else new.clone()
-    width = old.shape[-1]
-    kept = slice(-width, None) if name.startswith(_MAP_COMES_FIRST) else slice(width)
-    wide[..., kept] = old
+    wide[..., : old.shape[-1]] = old  # what is seen comes last everywhere
     return wide

@@ -94,11 +94,6 @@ class FrozenFolder:
         }
         self._write(folder, description)
 
-    def add_provenance(self, folder: Path, **entries: Any) -> None:
-        """Add entries to the provenance, or replace them; the identity does not change."""
-        description = self.read_description(folder)
-        self._write(folder, description | {"provenance": description["provenance"] | entries})
-
     def identity(self, folder: Path) -> str:
         """SHA-256 over all that the folder holds but the provenance, 16 hexadecimal digits."""
         description = self.read_description(folder)

@@ -2,7 +2,7 @@
 
 Every robot of a batch lives in the same world, so the whole terrain is part of one shared model. A tile is a
 square patch made by one function of :data:`TILES`. To add one, add a function there, and name it in the
-terrain of a stage (:mod:`lowlevel.presets`) and in ``evaluation.protocols.suites.SUITES``.
+terrain of a stage (:mod:`lowlevel.presets`) and in ``evaluation.protocols.crossing.OBSTACLES``.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ TILES: dict[str, TileFunction] = {tile.__name__: tile for tile in (flat, irregul
 
 @dataclass(frozen=True)
 class TerrainConfig:
-    """Which tiles the world holds; robots are spread over them evenly."""
+    """Which tiles the world holds: every kind in every level."""
 
     tiles: tuple[str, ...] = ("flat",)
     """Kinds of tile, in a row along y; each is a key of :data:`TILES`."""
@@ -147,6 +147,14 @@ class TerrainConfig:
     """Cell size of the height raster [m]."""
     seed: int = 0
     """Seed of the random tiles."""
+
+    def number_of(self, kind: Tensor, level: Tensor) -> Tensor:
+        """Numbers of tiles in ``Terrain.tile_centers``, from those of their ``kind`` and ``level`` in this terrain."""
+        return kind * len(self.levels) + level
+
+    def place_of(self, number: Tensor) -> tuple[Tensor, Tensor]:
+        """Kinds and levels of tiles, the inverse of :meth:`number_of`."""
+        return number // len(self.levels), number % len(self.levels)
 
 
 def tile_shares(config: TerrainConfig, device: torch.device | str = "cpu") -> Tensor:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lowlevel.commands import KINDS, shares
-from lowlevel.curriculum import QUALITY_TERMS, Curriculum, CurriculumConfig
+from lowlevel.curriculum import Curriculum, CurriculumConfig
 from lowlevel.world.terrain import TILES
 
 NAMES = list(KINDS)
@@ -15,8 +15,7 @@ def see(curriculum: Curriculum, quality: dict[str, float], fall_rate: float = 0.
     for name, value in quality.items():
         kind = torch.full((1000,), NAMES.index(name))
         fallen = torch.arange(1000) < 1000 * fall_rate
-        terms = {term: torch.full((1000,), value) for term in QUALITY_TERMS}
-        curriculum.observe(kind, torch.zeros_like(kind), terms, fallen)
+        curriculum.observe(kind, torch.zeros_like(kind), torch.full((1000,), value), fallen)
     curriculum.update()
 
 
@@ -55,7 +54,7 @@ def test_what_is_tracked_badly_is_drawn_more_often_down_to_a_floor() -> None:
 
 def test_conditions_become_harder_while_few_robots_fall_and_only_where_they_may() -> None:
     curriculum = Curriculum(CurriculumConfig())
-    kind, quality = torch.zeros(1000, dtype=torch.long), {term: torch.ones(1000) for term in QUALITY_TERMS}
+    kind, quality = torch.zeros(1000, dtype=torch.long), torch.ones(1000)
 
     def update(fall_rate: float, hardens: bool = True) -> float:
         curriculum.observe(kind, kind, quality, torch.arange(1000) < 1000 * fall_rate)
@@ -94,8 +93,8 @@ def test_tiles_are_drawn_by_what_they_lack_too() -> None:
     curriculum = Curriculum(CurriculumConfig())
     tile_shares = torch.tensor([name in ("flat", "stairs") for name in TILES]) / 2.0
     for number, quality in ((0, 0.8), (list(TILES).index("stairs"), 0.4)):
-        terms = {term: torch.full((100,), quality) for term in QUALITY_TERMS}
-        curriculum.observe(torch.zeros(100, dtype=torch.long), torch.full((100,), number), terms, torch.zeros(100))
+        kind, tile = torch.zeros(100, dtype=torch.long), torch.full((100,), number)
+        curriculum.observe(kind, tile, torch.full((100,), quality), torch.zeros(100))
     for _ in range(100):
         curriculum.update()
     chance = dict(zip(TILES, curriculum.tile_chances(tile_shares).tolist(), strict=True))

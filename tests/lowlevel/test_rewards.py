@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
-from lowlevel.rewards import REWARD_TERMS, RewardWeights, Transition, compute_rewards
+from lowlevel.rewards import REWARD_TERMS, RewardWeights, Transition, compute_rewards, tracking_quality
 from lowlevel.runs.checks import NonFiniteError
 from lowlevel.world.measures import Measurement, has_fallen, is_lost, stumbles, torso_error
 from robots.rotations import from_roll_pitch_yaw
@@ -166,6 +166,13 @@ def test_total_is_the_weighted_sum_per_second(standing: Transition) -> None:
     total, terms = compute_rewards(standing, weights, 0.02)
     expected = sum(0.02 * getattr(weights, name) * value for name, value in terms.items())
     assert torch.allclose(total, expected)
+
+
+def test_the_quality_of_tracking_does_not_depend_on_what_it_weighs(standing: Transition) -> None:
+    _, terms = compute_rewards(standing, RewardWeights(), 0.02)
+    tracked = ("linear_velocity", "angular_velocity", "base_height", "torso_orientation")
+    mean = torch.stack([terms[name] for name in tracked]).mean(dim=0)
+    assert torch.allclose(tracking_quality(standing), mean) and float(mean.max()) <= 1.0
 
 
 def test_a_term_that_is_not_finite_is_named(standing: Transition) -> None:

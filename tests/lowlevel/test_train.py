@@ -88,6 +88,13 @@ def test_a_run_that_sees_begins_with_what_a_blind_one_does(tmp_path: Path) -> No
         blind.begin_seeing(blind.run)
 
 
+def test_networks_that_see_do_not_begin_from_nothing(tmp_path: Path) -> None:
+    for preset in ("vision", "no-attention"):
+        with pytest.raises(SystemExit, match="name its folder with --blind"):
+            main([*ARGUMENTS, "--preset", preset, "--output", str(tmp_path)])
+    assert not list(tmp_path.iterdir())
+
+
 def test_same_seed_same_weights_other_seed_other_weights(tmp_path: Path) -> None:
     trainers = [Trainer(tiny(seed=seed), tmp_path) for seed in (1, 1, 2)]
     for trainer in trainers:

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +13,13 @@ from evaluation.protocols.arena import (
     Arena,
     Episode,
     HandLoad,
-    Moment,
     Push,
     batch_steps,
     constant,
     episode_seeds,
     hand_forces,
-    run_all,
 )
+from evaluation.protocols.trace import Channel, record
 from lowlevel.commands import ARMS, HEIGHT, VELOCITY, command_space
 from lowlevel.control.controller import Controller
 from lowlevel.control.observation import NoiseConfig
@@ -62,7 +61,6 @@ def test_robots_start_standing_at_the_commanded_height(arena: Arena, controller:
     assert (first.measured.projected_gravity[:, 2] < -0.9).all()
     upright = first.measured.torso_orientation[:, 0].abs()
     assert (upright > 0.999).all()
-    assert first.since_change.tolist() == pytest.approx([0.02] * 4)
 
 
 def test_an_episode_repeats_exactly_and_does_not_depend_on_its_company(arena: Arena, controller: Controller) -> None:
@@ -80,16 +78,8 @@ def test_batch_size_changes_no_more_than_rounding(controller: Controller) -> Non
     results = []
     for batch in (2, 5):
         arena = Arena(controller, FLAT, num_threads=1, batch=batch)
-        final = torch.zeros(5, 29)
-
-        def observe(first: int, group: Sequence[Episode], final: torch.Tensor = final) -> Callable[[Moment], None]:
-            def see(moment: Moment) -> None:
-                final[first : first + len(group)] = moment.measured.robot.joint_position[: len(group)]
-
-            return see
-
-        run_all(arena, episodes, observe)
-        results.append(final)
+        joints = Channel(lambda moment: moment.measured.robot.joint_position, (29,))
+        results.append(record(arena, episodes, {"joints": joints})["joints"][:, -1])
     np.testing.assert_allclose(results[0], results[1], atol=1e-4)
 
 
@@ -118,7 +108,6 @@ def test_commands_switch_on_time_and_are_clamped(arena: Arena, controller: Contr
     switched = [moment.command[0, HEIGHT].item() < 0.5 for moment in moments]
     assert switched == [False] * 5 + [True] * 5
     assert [moment.flag[0, 0].item() for moment in moments] == [1.0] * 5 + [0.0] * 5
-    assert moments[5].since_change[0].item() == pytest.approx(0.02)
     clamped = controller.clamp_command(impossible[None])[0]
     assert clamped[5] < 1.4
     torch.testing.assert_close(moments[-1].command[0], clamped)
@@ -267,8 +256,14 @@ def test_noise_reaches_what_the_controller_sees_but_not_what_is_measured(control
 def test_steps_are_counted_by_batches(arena: Arena, controller: Controller) -> None:
     episodes = standing(controller, 6, duration=0.1)
     passed: list[int] = []
-    run_all(arena, episodes, lambda first, batch: lambda moment: None, passed.append)
+    record(arena, episodes, {}, passed.append)
     assert sum(passed) == batch_steps(arena, episodes) == 10
+
+
+def test_conditions_that_no_episode_would_meet_are_refused(controller: Controller) -> None:
+    pushed = replace(RandomizationConfig.for_evaluation(), push_velocity=1.0)
+    with pytest.raises(ValueError, match="does not draw 'push_velocity'"):
+        Arena(controller, FLAT, pushed, num_threads=1, batch=1)
 
 
 def test_the_robot_has_the_controllers_gains(untrained_controller: Path) -> None:

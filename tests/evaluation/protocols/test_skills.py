@@ -10,7 +10,6 @@ import torch
 
 from evaluation.protocols.arena import Arena, Push
 from evaluation.protocols.skills import (
-    BARS,
     BOX_LOAD,
     CHANNELS,
     DEEP_BEND,
@@ -20,10 +19,10 @@ from evaluation.protocols.skills import (
     LOADED_WALK,
     PUSH,
     PUSH_SPEED,
+    SKILL_FIGURES,
     SKILLS,
     STOP,
     UNLOADED_BEND,
-    Bar,
     Phase,
     drift,
     feet_rest,
@@ -33,7 +32,6 @@ from evaluation.protocols.skills import (
     skill_figures,
 )
 from evaluation.protocols.trace import Trace, record
-from evaluation.reporting.statistics import mean_figure
 from lowlevel.control.controller import Controller
 from robots.g1.constants import ARM_JOINTS, JOINT_NAMES, PALM_OFFSET, SIDES, TORSO_BODY
 from robots.g1.model import build_spec
@@ -197,7 +195,7 @@ def test_figures_of_scripted_traces() -> None:
     stop["heading"][2, -1] = 0.2
     stop["foot_position"][3, 400:, 0, 0] = 0.05
     figures = skill_figures(traces)
-    assert set(figures) == set(BARS)
+    assert set(figures) == set(SKILL_FIGURES)
     values = {name: figure.value for name, figure in figures.items()}
     assert values["deep_bend_success"] == 0.5 and values["push_success"] == 1.0
     assert values["deep_bend_height_error"] == pytest.approx(0.02), "absolute, while bent only"
@@ -209,16 +207,6 @@ def test_figures_of_scripted_traces() -> None:
     assert values["stop_drift"] == pytest.approx(0.25 * 0.32 * 500 / 799, rel=1e-6)
     assert values["stop_turn"] == pytest.approx(0.05)
     assert all(figure.ci95 is not None for figure in figures.values())
-
-
-def test_a_bar_is_met_by_reaching_it() -> None:
-    assert Bar(0.9).is_met(mean_figure([0.9], "1")) and not Bar(0.9).is_met(mean_figure([0.89], "1"))
-    lowest = Bar(0.1, at_most=True)
-    assert lowest.is_met(mean_figure([0.1], "m")) and not lowest.is_met(mean_figure([0.11], "m"))
-    assert not lowest.is_met(mean_figure([], "m")), "nobody was measured"
-
-
-# -- robots --------------------------------------------------------------------------------------------------
 
 
 def test_a_trace_is_what_was_measured_and_ends_with_a_fall(controller: Controller) -> None:

@@ -23,7 +23,6 @@ from lowlevel.control.controller import (
     WEIGHTS_FILE,
     Controller,
     ControllerError,
-    add_metrics,
     content_hash,
 )
 from lowlevel.control.golden import replay
@@ -217,14 +216,6 @@ def test_wrong_number_of_robots_is_refused(folder: Path) -> None:
     controller = Controller.load(folder)
     with pytest.raises(RuntimeError, match=r"reset\(4\)"):
         replay(controller, golden_steps(folder)[0])
-
-
-def test_metrics_do_not_change_the_identity(folder: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
-    before = content_hash(copy)
-    add_metrics(copy, {"E_v": 0.1})
-    assert content_hash(copy) == before
-    assert Controller.load(copy).provenance["metrics"] == {"E_v": 0.1}
 
 
 def test_the_identity_covers_every_file(folder: Path, tmp_path: Path) -> None:

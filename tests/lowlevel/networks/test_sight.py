@@ -21,17 +21,18 @@ def observed(robots: int = 64) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor
 
 
 @pytest.mark.parametrize("mixture", [True, False])
-def test_until_it_makes_use_of_the_map_it_acts_as_the_blind_one(mixture: bool) -> None:
+@pytest.mark.parametrize("attention", [True, False])
+def test_until_it_makes_use_of_the_map_it_acts_as_the_blind_one(mixture: bool, attention: bool) -> None:
     blind = PilotActor(SIZES, replace(BLIND, mixture=mixture), MASK)
     blind.normalizer.update(3.0 + torch.randn(500, SIZES.frame))
-    actor = PilotActor(SIZES, replace(SEEING, mixture=mixture), MASK)
+    actor = PilotActor(SIZES, replace(SEEING, mixture=mixture, attention=attention), MASK)
     give_sight(actor, blind.state_dict())
     observation = observed()
     for ours, theirs in zip(actor(*observation), blind(*observation), strict=True):
         torch.testing.assert_close(ours, theirs)
     actor(*observation).mean.square().sum().backward()
     head = next(p for name, p in actor.head.named_parameters() if name in ("first.weight", "hidden.0.weight"))
-    assert head.grad is not None and bool((head.grad[:, : actor.perception_size] != 0.0).any())
+    assert head.grad is not None and bool((head.grad[:, -actor.perception_size :] != 0.0).any())
 
 
 def test_its_critic_values_as_the_blind_one() -> None:
