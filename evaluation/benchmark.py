@@ -45,6 +45,7 @@ from lowlevel.control.controller import Controller, content_hash
 from lowlevel.export import export_controller
 from lowlevel.presets import PRESETS
 from lowlevel.runs.command_line import command_line
+from lowlevel.runs.processes import available_cores
 from lowlevel.runs.progress import ProgressReport
 from lowlevel.trainer import Trainer, TrainingConfig
 from robots.errors import PilotError
@@ -60,7 +61,7 @@ class Arguments:
     """Robots of the batched simulation."""
     planner_robots: int = 64
     """Robots of the batched planner environment."""
-    cores: int = os.cpu_count() or 1
+    cores: int = available_cores()
     """Physics threads, and processes of the baselines."""
     seconds: float = 10.0
     """Time per measured rate [s]; the whole benchmark takes about ten times as long."""

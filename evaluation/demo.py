@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,9 +11,7 @@ import numpy as np
 import torch
 import tyro
 
-from evaluation.pictures.painter import NoOpenGLError, Painter, film_strip, following_camera, save_picture
 from evaluation.pictures.recording import EpisodeRecording, Recorder
-from evaluation.pictures.visuals import VisualTwin
 from evaluation.protocols.policies import SCRIPTED, controller_for, make_policy
 from evaluation.reporting.reports import (
     REPORT_FILE,
@@ -25,11 +22,14 @@ from evaluation.reporting.reports import (
 )
 from highlevel.action import interpolate
 from highlevel.environment import CommandEnvironment, PhysicsConfig, StepResult
+from highlevel.pictures.painter import NoOpenGLError, Painter, film_strip, following_camera, save_picture
+from highlevel.pictures.visuals import VisualTwin
 from highlevel.planner import planner_hash
 from highlevel.registry import load_task
 from highlevel.task import Decision, rows
 from lowlevel.control.controller import content_hash
 from lowlevel.runs.command_line import command_line
+from lowlevel.runs.processes import available_cores
 from lowlevel.runs.progress import ProgressReport
 from lowlevel.world.measures import Measurement
 from robots.errors import PilotError
@@ -58,7 +58,7 @@ class Arguments:
     works."""
     output: Path = Path("runs/demo")
     """Folder for the recording, report.md and pictures; files of the same name there are replaced."""
-    threads: int = os.cpu_count() or 1
+    threads: int = available_cores()
     """Threads of the physics."""
 
 

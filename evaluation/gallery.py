@@ -12,11 +12,11 @@ import torch
 import tyro
 
 from evaluation.baselines.onnx_policy import load_controller
-from evaluation.pictures.painter import Painter, film_strip, following_camera, save_picture
-from evaluation.pictures.visuals import VisualTwin
 from evaluation.protocols.arena import Arena, constant
 from evaluation.protocols.skills import HOLDING_ARMS
 from evaluation.reporting.reports import check_output
+from highlevel.pictures.painter import Painter, film_strip, following_camera, save_picture
+from highlevel.pictures.visuals import VisualTwin
 from highlevel.registry import find_controller
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.control.whole_body import Supports, WholeBodyController

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections import Counter
@@ -36,6 +35,7 @@ from highlevel.registry import load_task
 from highlevel.task import Task
 from lowlevel.control.controller import content_hash
 from lowlevel.runs.command_line import command_line
+from lowlevel.runs.processes import available_cores
 from lowlevel.runs.progress import ProgressReport
 from robots.errors import PilotError
 from robots.g1.model import describe_foreign
@@ -77,7 +77,7 @@ class Arguments:
     """Folder for report.md, metrics.json and plots; files of the same name there are replaced."""
     robots: int = ROBOTS
     """Robots side by side; the last digits of the figures depend on it."""
-    threads: int = os.cpu_count() or 1
+    threads: int = available_cores()
     """Threads to keep busy: of the physics, or, with controls or sweeps, of as many simulations."""
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Mapping
@@ -38,6 +37,7 @@ from evaluation.reporting.reports import (
 from evaluation.tracking_report import Evaluation, Measured, summary, write_report
 from lowlevel.control.whole_body import Supports, WholeBodyController
 from lowlevel.runs.command_line import command_line
+from lowlevel.runs.processes import available_cores
 from lowlevel.runs.progress import ProgressReport
 from lowlevel.world.terrain import TerrainConfig
 from robots.errors import PilotError
@@ -74,7 +74,7 @@ class Arguments:
     """Episodes of each skill test: deep bend, bend and walk with a box, stop, push; 0 leaves them out."""
     robots: int = BATCH
     """Robots side by side; the last digits of the figures depend on it."""
-    threads: int = os.cpu_count() or 1
+    threads: int = available_cores()
     """Physics threads."""
     record: int = 0
     """Also record this many of the first episodes for the rerun viewer."""
@@ -191,7 +191,7 @@ def _arena(tested: WholeBodyController, terrain: TerrainConfig, arguments: Argum
 def _strips(folder: Path, controllers: Mapping[str, WholeBodyController], supports: Supports) -> dict[str, str]:
     """Draw every controller in commands that all of them support; file names by controller, none without OpenGL."""
     from evaluation.gallery import draw  # OpenGL is seldom needed here
-    from evaluation.pictures.painter import NoOpenGLError, save_picture
+    from highlevel.pictures.painter import NoOpenGLError, save_picture
 
     files = {}
     for number, (name, controller) in enumerate(controllers.items(), start=1):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -33,6 +32,7 @@ from evaluation.reporting.reports import (
 from evaluation.reporting.statistics import Figure
 from lowlevel.control.whole_body import WholeBodyController
 from lowlevel.runs.command_line import command_line
+from lowlevel.runs.processes import available_cores
 from lowlevel.runs.progress import ProgressReport
 from robots.errors import PilotError
 from robots.g1.model import describe_foreign
@@ -62,7 +62,7 @@ class Arguments:
     """Folder for report.md, metrics.json and heat maps; files of the same name there are replaced."""
     robots: int = BATCH
     """Robots side by side; the last digits of the figures depend on it."""
-    threads: int = os.cpu_count() or 1
+    threads: int = available_cores()
     """Physics threads."""
 
 

@@ -4,5 +4,6 @@ Importing this package registers every task as a Gymnasium environment, such as 
 """
 
 from highlevel.registry import register_tasks
+from robots import startup as startup  # before MuJoCo is imported
 
 register_tasks()

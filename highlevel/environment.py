@@ -22,6 +22,7 @@ from highlevel.task import Decision, ObservationBlock, Task, rows
 from lowlevel.commands import COMMAND_SIZE
 from lowlevel.control.controller import Controller
 from lowlevel.runs.checks import require_finite
+from lowlevel.runs.precision import single_precision
 from lowlevel.world.measures import Measurement
 from lowlevel.world.terrain import TerrainConfig
 from lowlevel.world.world import World
@@ -104,6 +105,7 @@ class CommandEnvironment:
         PilotError: if another environment has the task.
     """
 
+    @single_precision()
     def __init__(
         self,
         task: Task,
@@ -153,6 +155,7 @@ class CommandEnvironment:
     # -- episodes --------------------------------------------------------------------------------------------
 
     @torch.no_grad()
+    @single_precision()
     def reset(self, seed: int | None = None) -> Tensor:
         """Begin new episodes everywhere: the next ones, or, with a ``seed``, the first ones of that seed.
 
@@ -182,6 +185,7 @@ class CommandEnvironment:
     # -- stepping --------------------------------------------------------------------------------------------
 
     @torch.no_grad()
+    @single_precision()
     def step(self, action: Tensor, auto_reset: bool = True, observers: Sequence[ControlObserver] = ()) -> StepResult:
         """One decision: ``action`` (N, 21) in [-1, 1], held as an option of several control steps.
 
@@ -261,6 +265,7 @@ class CommandEnvironment:
         fresh[over] = self.observe()[over]
         return replace(result, observation=fresh)
 
+    @single_precision()
     def observe(self) -> Tensor:
         """Observation (N, D) in physical units: the paper's blocks, then the task's additions.
 

@@ -1,7 +1,8 @@
 """Tasks by name, with their experts and Gymnasium ids, and the shipped controllers that they run on.
 
-A task is a folder ``tasks/<name>/`` whose package has an attribute ``TASK``, a function without required arguments that
-returns a :class:`highlevel.task.Task`. If it has a scripted expert, its attribute ``EXPERT`` makes one of a
+A task is a folder ``tasks/<name>/``, or a module that an installed package names in the entry-point group
+``open_pilot.tasks``. It has an attribute ``TASK``, a function without required arguments that returns a
+:class:`highlevel.task.Task`. If it has a scripted expert, its attribute ``EXPERT`` makes one of a
 :class:`highlevel.environment.CommandEnvironment`. Nothing under ``highlevel`` knows a task by name.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,36 +23,49 @@ from highlevel.task import Task
 from lowlevel.control.controller import content_hash
 from robots.errors import PilotError
 
+TASK_GROUP = "open_pilot.tasks"
+"""Entry-point group of tasks that live in other packages."""
 CONTROLLERS = Path(__file__).resolve().parents[1] / "checkpoints" / "lowlevel"
 """Where shipped controllers lie."""
 DEFAULT_CONTROLLER = "pilot-g1-simple"
 """The one of them that is used where none is asked for."""
 
 
-def task_names() -> list[str]:
-    """Names of the tasks that are installed."""
+def task_modules() -> dict[str, str]:
+    """The module of every task that is installed, by the task's name.
+
+    Raises:
+        PilotError: if an installed package has a task of the same name as another one.
+    """
     package = importlib.import_module("tasks")
-    return sorted(module.name for module in pkgutil.iter_modules(package.__path__) if module.ispkg)
+    folders = (module.name for module in pkgutil.iter_modules(package.__path__) if module.ispkg)
+    modules = {name: f"tasks.{name}" for name in sorted(folders)}
+    for entry in metadata.entry_points(group=TASK_GROUP):
+        if modules.setdefault(entry.name, entry.value) != entry.value:
+            raise PilotError(f"{entry.value} and {modules[entry.name]} are both called {entry.name!r}: rename one")
+    return modules
 
 
-def _package(name: str) -> ModuleType:
-    if name not in task_names():
-        raise PilotError(f"there is no task {name!r}; the tasks are: {', '.join(task_names()) or 'none'}")
-    return importlib.import_module(f"tasks.{name}")
+def _module(name: str) -> ModuleType:
+    modules = task_modules()
+    if name not in modules:
+        raise PilotError(f"there is no task {name!r}; the tasks are: {', '.join(modules) or 'none'}")
+    return importlib.import_module(modules[name])
 
 
 def load_task(name: str, **options: Any) -> Task:
-    """The task in folder ``tasks/<name>``; ``options`` go to its ``TASK``.
+    """The task of that name; ``options`` go to its ``TASK``.
 
     Raises:
-        PilotError: if there is no such task, or the folder does not hold one.
+        PilotError: if there is no such task, or its module does not hold one.
     """
-    factory = getattr(_package(name), "TASK", None)
+    module = _module(name)
+    factory = getattr(module, "TASK", None)
     if factory is None:
-        raise PilotError(f"tasks/{name}/__init__.py has no attribute TASK: it must name the task's class")
+        raise PilotError(f"{module.__name__} has no attribute TASK: it must name the task's class")
     task = factory(**options)
     if not isinstance(task, Task):
-        raise PilotError(f"TASK of tasks/{name} makes a {type(task).__name__}, not a highlevel.task.Task")
+        raise PilotError(f"TASK of {module.__name__} makes a {type(task).__name__}, not a highlevel.task.Task")
     return task
 
 
@@ -61,7 +76,7 @@ def load_expert(environment: CommandEnvironment) -> Policy:
         PilotError: if the task has none.
     """
     name = environment.task.name
-    expert = getattr(_package(name), "EXPERT", None)
+    expert = getattr(_module(name), "EXPERT", None)
     if expert is None:
         raise PilotError(f"task {name!r} has no scripted expert: train it with --demonstrations 0")
     policy: Policy = expert(environment)
@@ -75,7 +90,7 @@ def environment_id(name: str) -> str:
 
 def register_tasks() -> None:
     """Register ``pilot/<Task>-v0`` for every task; registering twice changes nothing."""
-    for name in task_names():
+    for name in task_modules():
         identity = environment_id(name)
         if identity not in gymnasium.registry:
             gymnasium.register(identity, entry_point="highlevel.gym_env:PlannerEnv", kwargs={"task": name})

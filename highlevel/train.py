@@ -40,9 +40,11 @@ def main(arguments: list[str] | None = None) -> None:
         trainer = _resumed(parsed.config, parsed.resume) if parsed.resume else _fresh(parsed)
         print(f"training in {trainer.run.path}", flush=True)
         trainer.train()
-    if trainer.best_rate >= 0:
+    if trainer.best_rate > 0:
         best = trainer.run.path / BEST_FOLDER
         print(f"best planner {best} with {trainer.best_rate:.1%} success on the selection episodes")
+    elif trainer.best_rate == 0:
+        print("no planner has succeeded in a selection episode yet")
     if not trainer.is_finished:
         print(f"train-highlevel: stopped; continue with --resume {trainer.run.path}", file=sys.stderr)
         sys.exit(130)

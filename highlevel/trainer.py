@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import KVWriter, Logger
 
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.episodes import run_episodes, stage_shares, success_rate
@@ -27,7 +27,7 @@ from highlevel.vec_env import PlannerVecEnv
 from lowlevel.control.controller import Controller, content_hash
 from lowlevel.runs.interrupts import stop_on_signals
 from lowlevel.runs.progress import ProgressReport
-from lowlevel.runs.run_folder import TENSORBOARD_FOLDER, RunFolder, describe_run
+from lowlevel.runs.run_folder import RunFolder, describe_run
 from robots.errors import PilotError
 
 DEMONSTRATIONS_FILE = "demonstrations.npz"
@@ -171,7 +171,7 @@ class PlannerTrainer:
 
     def _improve(self) -> None:
         """PPO, from the cloned policy or from nothing."""
-        self.model.set_logger(configure(str(self.run.path / TENSORBOARD_FOLDER), ["tensorboard"]))
+        self.model.set_logger(Logger(None, [_RunLog(self.run)]))
         remaining = self.config.total_decisions - self.model.num_timesteps
         if remaining > 0:
             with _progress("PPO", self.config.total_decisions) as update:
@@ -281,6 +281,20 @@ class PlannerTrainer:
         # The reset at the start of learning takes the episodes after these.
         self.vec_env._reset_seeds()
         self.run.drop_log_after("decisions", self.model.num_timesteps)
+
+
+class _RunLog(KVWriter):
+    """Hands what Stable-Baselines3 logs to TensorBoard by way of the run's folder."""
+
+    def __init__(self, run: RunFolder) -> None:
+        self._run = run
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        shown = {key: value for key, value in key_values.items() if "tensorboard" not in (key_excluded[key] or ())}
+        self._run.plot({key: float(value) for key, value in shown.items() if isinstance(value, (int, float))}, step)
+
+    def close(self) -> None:
+        """The folder's writer stays open."""
 
 
 class _TrainingCallback(BaseCallback):

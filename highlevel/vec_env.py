@@ -20,7 +20,7 @@ class PlannerVecEnv(VecEnv):
 
     Episodes end with the entries that Stable-Baselines3 knows (``terminal_observation``, ``episode``,
     ``is_success``, and ``TimeLimit.truncated``, which is never true because the time left is observed) and ``stage``
-    and ``failure``. Robots whose episode goes on share empty infos.
+    and ``failure``.
     """
 
     def __init__(self, environment: CommandEnvironment) -> None:
@@ -28,7 +28,6 @@ class PlannerVecEnv(VecEnv):
         self.render_mode = None
         observation_space, action_space = spaces(environment)
         super().__init__(environment.num_envs, observation_space, action_space)
-        self._infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._actions = torch.zeros(self.num_envs, *action_space.shape)
         self._return = np.zeros(self.num_envs)
         self._length = np.zeros(self.num_envs, dtype=int)
@@ -59,10 +58,9 @@ class PlannerVecEnv(VecEnv):
         reward, done = result.reward.numpy(), result.done.numpy()
         self._return += reward
         self._length += 1
-        infos = self._infos
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]  # wrappers write into them
         over = np.flatnonzero(done)
         if len(over):
-            infos = infos.copy()
             final, elapsed = result.final_observation.numpy(), time.monotonic() - self._began
             for robot in over.tolist():
                 infos[robot] = {

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from evaluation.pictures.painter import NoOpenGLError, find_platform
+from highlevel.pictures.painter import NoOpenGLError, find_platform
 from lowlevel.commands import command_space
 from lowlevel.control.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
 from lowlevel.control.observation import FRAME, normalized_columns

@@ -20,8 +20,8 @@ import rerun.blueprint as rrb
 import torch
 from torch import Tensor
 
-from evaluation.pictures.visuals import VISIBLE_GROUPS, VisualTwin
 from evaluation.protocols.arena import Arena, Episode
+from highlevel.pictures.visuals import VISIBLE_GROUPS, VisualTwin
 from lowlevel.commands import ARMS, HEIGHT, TORSO, VELOCITY
 from lowlevel.control.elevation_map import MAP_CELLS, MAP_RESOLUTION
 from lowlevel.world.measures import Measurement

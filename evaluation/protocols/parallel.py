@@ -6,6 +6,7 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from evaluation.protocols.policies import make_policy
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.episodes import EpisodeRecord, run_episodes
 from highlevel.task import Task
+from robots.errors import PilotError
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,8 @@ def run_all(
             future.result()
             finished += futures[future].count
             on_progress(futures[future].name, finished)
+    except BrokenProcessPool as error:
+        raise PilotError("a worker process was killed, perhaps for want of memory: try fewer --threads") from error
     except BaseException:
         # Their results are lost either way; a run that goes on would keep this process waiting for minutes.
         for process in multiprocessing.active_children():

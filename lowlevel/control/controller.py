@@ -41,6 +41,7 @@ from lowlevel.networks.actor import NetworkConfig, ObservationSizes, PilotActor
 from lowlevel.runs.configs import from_plain
 from lowlevel.runs.files import atomic_write
 from lowlevel.runs.frozen_folder import FrozenFolder
+from lowlevel.runs.precision import single_precision
 from robots.errors import PilotError
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
@@ -171,6 +172,7 @@ class Controller:
         """Robots that have kept them for LOST_AFTER control steps (N,): damp their motors."""
         return self._steps_held >= LOST_AFTER
 
+    @single_precision()
     def reset(self, num_robots: int, ids: Tensor | None = None) -> None:
         """Forget everything about robots ``ids`` (all ``num_robots`` by default)."""
         fresh = self.step.first_memory(num_robots)
@@ -187,6 +189,7 @@ class Controller:
         self._steps_held = torch.where(begins, 0, self._steps_held)
 
     @torch.no_grad()
+    @single_precision()
     def act(self, proprioception: Proprioception, elevation_map: Tensor, command: Tensor, flag: Tensor) -> Tensor:
         """PD targets (N, 29) [rad] for the next control period.
 
@@ -201,6 +204,8 @@ class Controller:
         """
         if not self._memory or len(self._memory["action"]) != len(command):
             raise RuntimeError(f"call reset({len(command)}) before act() with {len(command)} robots")
+        proprioception = Proprioception(*(tensor.float() for tensor in vars(proprioception).values()))
+        elevation_map, command, flag = elevation_map.float(), command.float(), flag.float()
         result = self.step(proprioception, elevation_map, command, flag, self._memory)
         usable = _all_finite(*vars(proprioception).values(), elevation_map, command, flag)
         self._steps_held = torch.where(usable, 0, self._steps_held + 1)
@@ -242,6 +247,7 @@ class Controller:
     # -- folders ----------------------------------------------------------------------------------------------
 
     @classmethod
+    @single_precision()
     def load(
         cls,
         folder: Path | str,

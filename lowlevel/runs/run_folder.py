@@ -144,17 +144,21 @@ class RunFolder:
     def log(self, figures: Mapping[str, float], seconds: float, counter: str, count: int) -> None:
         """Append the finite ``figures`` to ``log.jsonl`` and TensorBoard, at ``count`` of what ``counter`` names."""
         finite = {name: value for name, value in figures.items() if math.isfinite(value)}
-        if self._writer is None:
-            self._writer = SummaryWriter(str(self.path / TENSORBOARD_FOLDER))
-        for name, value in finite.items():
-            self._writer.add_scalar(name, value, count)
+        self.plot(finite, count)
         entry = {counter: count, "seconds": seconds, **finite}
         with (self.path / LOG_FILE).open("a") as file:
             file.write(json.dumps({name: float(f"{value:.6g}") for name, value in entry.items()}) + "\n")
 
+    def plot(self, figures: Mapping[str, float], count: int) -> None:
+        """Show ``figures`` in TensorBoard alone."""
+        if self._writer is None:
+            self._writer = SummaryWriter(str(self.path / TENSORBOARD_FOLDER))
+        for name, value in figures.items():
+            self._writer.add_scalar(name, value, count)
+
     def drop_log_after(self, counter: str, last: int) -> None:
-        """Remove what a killed run logged after its last save, when ``counter`` was ``last``."""
-        SummaryWriter(str(self.path / TENSORBOARD_FOLDER), purge_step=last + 1).close()
+        """Remove what a killed run logged after its last save, when ``counter`` was ``last``; call it before logging."""
+        self._writer = SummaryWriter(str(self.path / TENSORBOARD_FOLDER), purge_step=last + 1)
         path = self.path / LOG_FILE
         if not path.exists():
             return
@@ -193,15 +197,17 @@ def _plain_paths(items: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def git_revision() -> str:
-    """Commit of the source tree, with ``-dirty`` if it has uncommitted changes; ``unknown`` outside a checkout."""
+    """Commit of the source tree, with ``-dirty`` if it has uncommitted changes; ``unknown`` outside its checkout."""
+    source = Path(__file__).resolve().parents[2]
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", *arguments], cwd=source, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
     try:
-        described = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        # Installed into another project's environment, the source lies in that one's checkout.
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != source:
+            return "unknown"
+        return git("describe", "--always", "--dirty", "--abbrev=12")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return described.stdout.strip()

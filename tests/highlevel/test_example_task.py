@@ -16,7 +16,7 @@ from evaluation import highlevel as evaluation
 from highlevel import train
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.planner import Planner
-from highlevel.registry import environment_id, load_task, register_tasks, task_names
+from highlevel.registry import environment_id, load_task, register_tasks, task_modules
 from highlevel.trainer import BEST_FOLDER
 
 
@@ -31,7 +31,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_the_folder_is_found_and_registered(untrained_controller: Path, coarse_physics: PhysicsConfig) -> None:
-    assert {"lift_box", "squat"} <= set(task_names())
+    assert {"lift_box", "squat"} <= task_modules().keys()
     environment = gymnasium.make("pilot/Squat-v0", controller=untrained_controller, physics=coarse_physics)
     check_env(environment.unwrapped, skip_render_check=True)
 

@@ -10,7 +10,9 @@ import gymnasium
 import numpy as np
 import pytest
 import stable_baselines3.common.env_checker
+import torch
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import highlevel  # noqa: F401 (registers the tasks)
@@ -32,6 +34,45 @@ def test_the_gymnasium_environment_passes_both_checkers(
         warnings.filterwarnings("ignore", message=".*(infinity|alternative render modes|spec).*")
         check_env(environment)
         stable_baselines3.common.env_checker.check_env(environment)
+
+
+def test_stable_baselines_makes_it_like_any_other(untrained_controller: Path, coarse_physics: PhysicsConfig) -> None:
+    arguments = {"controller": untrained_controller, "physics": coarse_physics}
+    vec_env = make_vec_env("pilot/LiftBox-v0", n_envs=2, seed=0, env_kwargs=arguments)
+    vec_env.reset()
+    _, _, _, infos = vec_env.step(np.zeros((2, 21), np.float32))
+    assert [info["is_success"] for info in infos] == [False, False]
+
+
+def test_it_draws_pictures(untrained_controller: Path, coarse_physics: PhysicsConfig, has_opengl: bool) -> None:
+    with pytest.raises(TypeError, match="no render mode 'human'"):
+        PlannerEnv("lift_box", untrained_controller, coarse_physics, render_mode="human")
+    assert PlannerEnv("lift_box", untrained_controller, coarse_physics).render() is None
+    environment = PlannerEnv("lift_box", untrained_controller, coarse_physics, render_mode="rgb_array")
+    environment.reset(seed=0)
+    if not has_opengl:
+        pytest.skip("this machine cannot render")
+    first = environment.render()
+    assert first is not None and first.shape == (480, 640, 3) and first.std() > 10.0
+    for _ in range(5):
+        environment.step(np.ones(21, np.float32))
+    second = environment.render()
+    assert second is not None and (first != second).any()
+    environment.close()
+
+
+def test_double_precision_around_it_changes_nothing(untrained_controller: Path, coarse_physics: PhysicsConfig) -> None:
+    def rewards() -> list[float]:
+        environment = PlannerEnv("lift_box", untrained_controller, coarse_physics)
+        environment.reset(seed=0)
+        return [environment.step(np.full(21, 0.3))[1] for _ in range(3)]
+
+    usual = rewards()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert rewards() == usual
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def test_stepping_a_finished_gymnasium_episode_is_refused(

@@ -9,8 +9,8 @@ import torch
 from rerun.chunk import Chunk, RrdReader
 
 from evaluation.pictures.recording import EpisodeRecording, Recorder, map_points, measured_posture
-from evaluation.pictures.visuals import VisualTwin
 from evaluation.protocols.arena import Arena, constant
+from highlevel.pictures.visuals import VisualTwin
 from lowlevel.control.controller import Controller
 from lowlevel.world.terrain import TerrainConfig
 from robots.g1.constants import HAND_BODIES

@@ -192,6 +192,21 @@ def test_inference_mode_may_begin_and_end_between_two_steps(folder: Path, runtim
     replay(controller, second)
 
 
+@pytest.mark.parametrize("runtime", ["onnx", "torch"])
+def test_double_precision_around_it_changes_nothing(folder: Path, runtime: Literal["onnx", "torch"]) -> None:
+    first = golden_steps(folder)[0]
+    usual = Controller.load(folder, runtime=runtime)
+    usual.reset(4)
+    torch.set_default_dtype(torch.float64)
+    try:
+        controller = Controller.load(folder, runtime=runtime)
+        controller.reset(4)
+        targets = replay(controller, {name: value.double() for name, value in first.items()})
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(targets, replay(usual, first))
+
+
 def test_a_controller_can_be_copied_and_pickled_with_what_it_remembers(folder: Path) -> None:
     controller = Controller.load(folder)
     controller.reset(4)

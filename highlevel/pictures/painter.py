@@ -104,6 +104,10 @@ class Painter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free OpenGL's resources."""
         self._context.make_current()
         self._renderer.free()
         self._context.free()

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from evaluation.pictures import painter as pictures
-from evaluation.pictures.painter import (
+from highlevel.pictures import painter as pictures
+from highlevel.pictures.painter import (
     NoOpenGLError,
     Painter,
     film_strip,
@@ -17,7 +17,7 @@ from evaluation.pictures.painter import (
     following_camera,
     save_picture,
 )
-from evaluation.pictures.visuals import VisualTwin
+from highlevel.pictures.visuals import VisualTwin
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,1 @@
+"""Offscreen pictures of the robot with its meshes."""
