@@ -56,10 +56,14 @@ def _fresh(arguments: Arguments) -> PlannerTrainer:
     config = replace(arguments.config, controller=find_controller(arguments.config.controller).resolve())
     if config.demonstration_file is not None:
         config = replace(config, demonstration_file=config.demonstration_file.resolve())
+    if config.warm_start is not None:
+        config = replace(config, warm_start=config.warm_start.resolve())
     trainer = _trainer(config, folder)
+    # What cannot be used is refused before anything is written.
     if config.demonstration_file is not None:
-        # A file that cannot be used is refused before anything is written.
         Demonstrations.load(config.demonstration_file).source.require_like(trainer.source)
+    if config.warm_start is not None:
+        trainer.earlier_planner(config.warm_start)
     trainer.run.claim()
     trainer.run.describe(config)
     trainer.save()
@@ -72,10 +76,11 @@ def _default_config(given: list[str]) -> PlannerTrainingConfig:
     if run is None:
         return PlannerTrainingConfig()
     config = run.config(PlannerTrainingConfig)
-    controller, demonstrations = (
-        None if path is None else Path(path) for path in (config.controller, config.demonstration_file)
+    controller, demonstrations, earlier = (
+        None if path is None else Path(path)
+        for path in (config.controller, config.demonstration_file, config.warm_start)
     )
-    return replace(config, controller=controller, demonstration_file=demonstrations)
+    return replace(config, controller=controller, demonstration_file=demonstrations, warm_start=earlier)
 
 
 def _resumed(config: PlannerTrainingConfig, folder: Path) -> PlannerTrainer:

@@ -97,7 +97,7 @@ class PlannerTrainer:
         """Go through the remaining phases; Ctrl-C and SIGTERM end the run with its work saved."""
         with stop_on_signals(self._request_stop):
             if self.phase == "demonstrations":
-                self._imitate()
+                self._begin()
             if self.phase == "ppo" and not self._stop_requested:
                 self._improve()
             self.save()
@@ -111,29 +111,51 @@ class PlannerTrainer:
         """End the run at the next safe point, with its work saved."""
         self._stop_requested = True
 
-    def _imitate(self) -> None:
-        """Record or read demonstrations and clone them."""
-        if self.config.imitates:
-            demonstrations = self._demonstrations()
+    def _begin(self) -> None:
+        """Take the policy that PPO begins with from an earlier planner or from demonstrations, if from anything."""
+        if self.config.warm_start is not None:
+            self.earlier_planner(self.config.warm_start).actor.write_to(self.model.policy)
+        elif self.config.imitates:
+            self._imitate()
             if self._stop_requested:
                 return
-            config = self.config.cloning
-            with _progress("cloning", config.epochs) as update:
-                result = clone(
-                    self.model.policy,
-                    demonstrations,
-                    self.scale,
-                    config,
-                    self.config.seed,
-                    lambda epoch, error: update(epoch, f"action error {error:.3f}"),
-                )
+        if self.config.begins_skilled:
             self.model.set_exploration(self.config.ppo.log_std_after_cloning)
-            self._log({f"cloning/{name}": value for name, value in asdict(result).items()})
-            self.planner().save(self.run.path / CLONED_FOLDER)
         # A run that was resumed before this has no seed pending, and recording has left its own.
         self.vec_env.seed(self.episode_seed)
         self.phase = "ppo"
         self.save()
+
+    def earlier_planner(self, folder: Path) -> Planner:
+        """The planner in ``folder``, if this run can go on from it.
+
+        Raises:
+            PilotError: if it cannot.
+        """
+        planner = Planner.load(folder)
+        planner.require_environment(self.environment)
+        if planner.config.hidden != self.config.network.hidden:
+            wanted = " ".join(map(str, planner.config.hidden))
+            raise PilotError(f"the planner in {folder} has other widths: add --network.hidden {wanted}")
+        return planner
+
+    def _imitate(self) -> None:
+        """Record or read demonstrations and clone them."""
+        demonstrations = self._demonstrations()
+        if self._stop_requested:
+            return
+        config = self.config.cloning
+        with _progress("cloning", config.epochs) as update:
+            result = clone(
+                self.model.policy,
+                demonstrations,
+                self.scale,
+                config,
+                self.config.seed,
+                lambda epoch, error: update(epoch, f"action error {error:.3f}"),
+            )
+        self._log({f"cloning/{name}": value for name, value in asdict(result).items()})
+        self.planner().save(self.run.path / CLONED_FOLDER)
 
     def _demonstrations(self) -> Demonstrations:
         """What to imitate; recording goes on where an interrupted run stopped."""
@@ -197,11 +219,12 @@ class PlannerTrainer:
             hidden=self.config.network.hidden,
         )
         # A planner travels: of the files that made it, it keeps the names, not where they lay.
-        recorded = self.config.demonstration_file
+        recorded, earlier = self.config.demonstration_file, self.config.warm_start
         named = replace(
             self.config,
             controller=Path(self.controller.name),
             demonstration_file=None if recorded is None else Path(recorded.name),
+            warm_start=None if earlier is None else Path(earlier.name),
         )
         details: dict[str, Any] = {"decisions": self.model.num_timesteps, "hours": self.trained_seconds / 3600.0}
         if self.config.imitates:

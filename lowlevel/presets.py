@@ -84,8 +84,9 @@ EVERYTHING = (
 """Unlike the evaluation it also stands in the neutral posture, what a planner starts from and stops in, walks slowly,
 and holds both arms alike, as around a box."""
 
-SLABS = TerrainConfig(tiles=("flat", "irregular"), tile_size=8.0)
-"""The simple terrain of the paper: flat, and irregular by 2 cm."""
+UNEVEN = TerrainConfig(tiles=("flat", "rough"), levels=(1.0 / 3.0,), tile_size=8.0)
+"""Like the simple terrain of the paper: flat, and steps of up to 4 cm, made of a tenth of the blocks that the slabs of the
+evaluation take."""
 
 SLOW_STEPS = 1.43
 """Gait frequency for a robot that learns to walk [Hz]: at 2 Hz the prior's legs, which follow late, turn the pelvis by
@@ -213,7 +214,7 @@ STAGES = (
         noise_at_rest=0.6,
         rollout_doublings=1,
         mixture=EVERYTHING,
-        terrain=SLABS,
+        terrain=UNEVEN,
         rewards=EXACT,
         randomization=HARD,
     ),
@@ -223,7 +224,7 @@ STAGES = (
         rollout_doublings=2,
         arms_act=True,
         mixture=EVERYTHING,
-        terrain=SLABS,
+        terrain=UNEVEN,
         rewards=replace(EXACT, foot_phase=0.0, foot_placement=0.0, contact_schedule=0.0, swing_height=0.0),
         randomization=HARD,
     ),

@@ -37,6 +37,19 @@ _ARM_CURVES = tuple(name.removesuffix("_joint") for name in JOINT_NAMES[ARM_JOIN
 _FLOOR_HALF_SIZE = 15.0
 
 
+_VIEWER_SECONDS = 5.0
+"""How long a viewer may take to answer once it has been started [s]."""
+
+
+def _open_viewer(stream: rr.RecordingStream) -> None:
+    try:
+        stream.spawn()
+        stream.flush(timeout_sec=_VIEWER_SECONDS)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise PilotError(f"no live view ({reason}): leave out --live and open the recording") from error
+
+
 class Recorder:
     """A stream to a file, a viewer, or both. A context manager: the file appears at the end of the block.
 
@@ -45,7 +58,7 @@ class Recorder:
         live: open a viewer and stream to it.
 
     Raises:
-        PilotError: if a viewer is wanted where there is no display.
+        PilotError: if a viewer is wanted where there is no display or no viewer, or where it does not answer.
     """
 
     def __init__(self, path: Path | None, live: bool = False) -> None:
@@ -56,7 +69,7 @@ class Recorder:
         self.stream = rr.RecordingStream(APPLICATION)
         sinks: list[rr.GrpcSink | rr.FileSink] = []
         if live:
-            self.stream.spawn()
+            _open_viewer(self.stream)
             sinks.append(rr.GrpcSink())
         if self._partial is not None:
             sinks.append(rr.FileSink(self._partial))

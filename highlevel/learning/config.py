@@ -27,7 +27,8 @@ class PPOConfig:
     learning_rate: float = 1e-4
     """Without demonstrations."""
     learning_rate_after_cloning: float = 1e-5
-    """With demonstrations: an update may change the policy by so much in units of its exploration, which is small."""
+    """With demonstrations or a warm start: an update may change the policy by so much in units of its exploration,
+    which is small."""
     log_std_after_cloning: float = -4.0
     """Logarithm of the standard deviation of the action from then on: grasps that were cloned fail under the
     exploration that training from nothing needs."""
@@ -55,6 +56,8 @@ class PlannerTrainingConfig:
     """Successful expert episodes to imitate first; 0 trains from nothing."""
     demonstration_file: Path | None = None
     """Use these recorded demonstrations instead of recording new ones."""
+    warm_start: Path | None = None
+    """Go on from the planner in this folder, of whatever controller, instead of imitating demonstrations."""
     demonstration_noise: float = 0.02
     """Standard deviation of the noise on the expert's executed actions."""
     total_decisions: int = 200_000
@@ -78,7 +81,12 @@ class PlannerTrainingConfig:
     @property
     def imitates(self) -> bool:
         """Whether demonstrations are cloned before PPO."""
-        return self.demonstrations > 0 or self.demonstration_file is not None
+        return self.warm_start is None and (self.demonstrations > 0 or self.demonstration_file is not None)
+
+    @property
+    def begins_skilled(self) -> bool:
+        """Whether PPO begins with a policy that succeeds: it explores little then, its critic learns alone at first."""
+        return self.imitates or self.warm_start is not None
 
     @property
     def decisions_per_update(self) -> int:

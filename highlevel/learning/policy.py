@@ -75,6 +75,16 @@ class PlannerActor(nn.Module):
         actor.scale.copy_(normalizer.scale)
         return actor.eval().requires_grad_(False)
 
+    @torch.no_grad()
+    def write_to(self, policy: ActorCriticPolicy) -> None:
+        """Make a policy of the same shape act like this, the inverse of :meth:`from_policy`."""
+        normalizer = policy.features_extractor
+        assert isinstance(normalizer, Normalizer)
+        policy.mlp_extractor.policy_net.load_state_dict(self.hidden.state_dict())
+        policy.action_net.load_state_dict(self.output.state_dict())
+        normalizer.mean.copy_(self.mean)
+        normalizer.scale.copy_(self.scale)
+
 
 def policy_arguments(network: PlannerNetwork, scale: Tensor) -> dict[str, object]:
     """``policy_kwargs`` of Stable-Baselines3's ``MlpPolicy``; ``scale`` (D,) is the task's own observation

@@ -17,7 +17,8 @@ from lowlevel.runs.checks import require_finite
 class PlannerPPO(PPO):
     """PPO on all robots of ``vec_env``.
 
-    After cloning the actor is good and the critic is not, so the first ``warm_up_updates`` leave the actor alone.
+    After cloning or a warm start the actor is good and the critic is not, so the first ``warm_up_updates`` leave the
+    actor alone.
 
     Args:
         config: the run.
@@ -27,9 +28,9 @@ class PlannerPPO(PPO):
 
     def __init__(self, config: PlannerTrainingConfig, vec_env: VecEnv, scale: Tensor) -> None:
         ppo = config.ppo
-        self.warm_up_updates = ppo.warm_up_updates if config.imitates else 0
+        self.warm_up_updates = ppo.warm_up_updates if config.begins_skilled else 0
         self.finished_updates = 0
-        rate = ppo.learning_rate_after_cloning if config.imitates else ppo.learning_rate
+        rate = ppo.learning_rate_after_cloning if config.begins_skilled else ppo.learning_rate
         super().__init__(
             "MlpPolicy",
             vec_env,

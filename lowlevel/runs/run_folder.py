@@ -157,7 +157,7 @@ class RunFolder:
             self._writer.add_scalar(name, value, count)
 
     def drop_log_after(self, counter: str, last: int) -> None:
-        """Remove what a killed run logged after its last save, when ``counter`` was ``last``; call it before logging."""
+        """Remove what a killed run logged after its last save, when ``counter`` was ``last``; before logging."""
         self._writer = SummaryWriter(str(self.path / TENSORBOARD_FOLDER), purge_step=last + 1)
         path = self.path / LOG_FILE
         if not path.exists():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -70,13 +71,38 @@ def test_a_run_trains_and_resumes(untrained_controller: Path, tmp_path: Path, qu
     description["config"]["total_decisions"] = 192
     (folder / "run.json").write_text(json.dumps(description))
     assert RunFolder(folder).config(PlannerTrainingConfig).total_decisions == 192
-    main(["--resume", str(folder)])
+    main(["--resume", str(folder)])  # a finished run goes on, too
     resumed = torch.load(folder / STATE_FILE, weights_only=True)
     assert resumed["decisions"] == 192 and resumed["updates"] == 3
     changed = [not torch.equal(state["policy"][name], resumed["policy"][name]) for name in state["policy"]]
     assert any(changed)
     for name in ("features_extractor.mean", "features_extractor.scale"):
         torch.testing.assert_close(state["policy"][name], resumed["policy"][name])
+
+
+def test_a_planner_of_another_controller_is_trained_on(
+    untrained_controller: Path, tmp_path: Path, quick_episodes: None
+) -> None:
+    start = [*_TINY, f"--controller={untrained_controller}", f"--output={tmp_path}"]
+    main([*start, "--name=first", "--total-decisions=64"])
+    first = Planner.load(tmp_path / "first" / BEST_FOLDER)
+    other = Path(shutil.copytree(untrained_controller, tmp_path / "controller"))
+    description = json.loads((other / "controller.json").read_text())
+    (other / "controller.json").write_text(json.dumps(description | {"note": "another identity"}))
+    again = [
+        *_TINY,
+        f"--controller={other}",
+        f"--output={tmp_path}",
+        f"--warm-start={tmp_path / 'first' / BEST_FOLDER}",
+    ]
+    main([*again, "--name=second", "--total-decisions=64", "--ppo.warm-up-updates=1"])
+    second = Planner.load(tmp_path / "second" / BEST_FOLDER, other)
+    for before, after in zip(first.actor.parameters(), second.actor.parameters(), strict=True):
+        assert torch.equal(before, after), "only the critic has learned by now"
+    assert second.provenance["config"]["warm_start"] == BEST_FOLDER
+    with pytest.raises(SystemExit, match=r"other widths: add --network\.hidden 16 16"):
+        main([*again, "--name=third", "--network.hidden", "32"])
+    assert not (tmp_path / "third").exists()
 
 
 def test_a_run_resumed_while_it_records_does_not_train_on_the_demonstrations_episodes(

@@ -13,6 +13,7 @@ from evaluation.protocols.arena import Arena, constant
 from highlevel.pictures.visuals import VisualTwin
 from lowlevel.control.controller import Controller
 from lowlevel.world.terrain import TerrainConfig
+from robots.errors import PilotError
 from robots.g1.constants import HAND_BODIES
 
 
@@ -148,3 +149,17 @@ def test_measured_posture_inverts_the_command_convention(arena: Arena) -> None:
     mujoco.mju_mat2Quat(quaternion, (turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)).flatten())
     measured = replace(moment.measured, torso_orientation=torch.tensor(quaternion[None], dtype=torch.float32))
     np.testing.assert_allclose(measured_posture(measured)[0, 4:7], [roll, pitch, yaw], atol=1e-5)
+
+
+@pytest.mark.parametrize("fails", ["spawn", "flush"])
+def test_a_viewer_that_is_missing_or_does_not_answer_is_named(fails: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*arguments: object, **options: object) -> None:
+        raise RuntimeError("Failed to find Rerun Viewer executable in PATH.\n\nYou can install it.")
+
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setattr("rerun.RecordingStream.spawn", lambda stream: None)
+    monkeypatch.setattr(f"rerun.RecordingStream.{fails}", fail)
+    with pytest.raises(
+        PilotError, match=r"^no live view \(Failed to find Rerun Viewer executable in PATH\): leave out"
+    ):
+        Recorder(None, live=True)
