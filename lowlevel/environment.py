@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, TypeVar
 
 import torch
-import tyro
 from torch import Tensor
 
 from lowlevel.buffers import Buffers
 from lowlevel.commands import (
     HEIGHT,
     KINDS,
-    PROTOCOL,
     VELOCITY,
     CommandSampler,
-    Mixture,
     command_space,
     shares,
 )
@@ -31,13 +27,14 @@ from lowlevel.control.observation import (
 )
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.control.stepping import swing_first
-from lowlevel.gait_prior import GaitPrior, GaitPriorConfig
+from lowlevel.gait_prior import GaitPrior
 from lowlevel.levels import Levels
-from lowlevel.rewards import RewardWeights, Transition, compute_rewards, tracking_quality
+from lowlevel.rewards import Transition, compute_rewards, tracking_quality
+from lowlevel.task import TaskConfig
 from lowlevel.world.measures import Measurement, is_lost, velocity_error, with_rows
 from lowlevel.world.privileged import PRIVILEGED, PrivilegedView
-from lowlevel.world.randomization import RandomizationConfig, Randomizer
-from lowlevel.world.terrain import TerrainConfig, tile_shares
+from lowlevel.world.randomization import Randomizer
+from lowlevel.world.terrain import tile_shares
 from lowlevel.world.world import World
 from robots.g1.constants import ARM_JOINTS, NUM_JOINTS, gain_set
 from robots.g1.model import ModelOptions
@@ -46,14 +43,10 @@ from robots.rotations import rotate_about_vertical
 AVERAGING = 0.4
 """Time constant of the averaged velocity error [s]: the sway of one step is averaged out, a drift is not."""
 
-Value = TypeVar("Value")
-FromStage = Annotated[Value, tyro.conf.Suppress]
-"""A field that is no option of a command line, because the stages of a run decide it."""
-
 
 @dataclass(frozen=True)
 class EnvironmentConfig:
-    """Everything about the low-level task except learning."""
+    """How robots are simulated, and how their episodes begin and end, whatever their task."""
 
     num_robots: int = 1024
     """Robots simulated side by side."""
@@ -74,17 +67,6 @@ class EnvironmentConfig:
     action_limit: float = 12.0
     """Actions are clipped to +- this many action scales; the lift of a knee takes 10."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
-    # What the stages of a training run set (lowlevel.stages)
-    reference: FromStage[ReferenceConfig] = field(default_factory=ReferenceConfig)
-    arms_act: FromStage[bool] = True
-    """Whether the policy corrects the arms too; their targets are the slewed command otherwise."""
-    prior: FromStage[GaitPriorConfig | None] = None
-    """The gait prior; none in everything that is evaluated or deployed."""
-    mixture: FromStage[Mixture] = PROTOCOL
-    """Kinds of command and their shares."""
-    terrain: FromStage[TerrainConfig] = field(default_factory=TerrainConfig)
-    randomization: FromStage[RandomizationConfig] = field(default_factory=RandomizationConfig)
-    rewards: FromStage[RewardWeights] = field(default_factory=RewardWeights)
 
 
 @dataclass(frozen=True)
@@ -118,33 +100,41 @@ class PilotEnvironment:
     """Batched environment with auto-reset.
 
     Args:
-        config: the task.
+        config: robots, physics and episodes.
+        task: what they are to do.
         seed: seed of commands, noise, randomization and resets.
         device: where tensors live.
     """
 
-    def __init__(self, config: EnvironmentConfig, seed: int = 0, device: torch.device | str = "cpu") -> None:
-        self.config = config
+    def __init__(
+        self,
+        config: EnvironmentConfig,
+        task: TaskConfig = TaskConfig(),  # noqa: B008 (frozen)
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.config, self.task = config, task
         self.device = torch.device(device)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         gains = gain_set(config.gains)
         options = ModelOptions(gains=gains, timestep=config.timestep)
-        self.world = World(options, config.terrain, config.num_robots, config.num_threads, device)
+        self.world = World(options, task.terrain, config.num_robots, config.num_threads, device)
         self.simulation = self.world.simulation
         self.control_period = self.simulation.control_period
         self.max_steps = round(config.episode_length / self.control_period)
         lower, upper = self.simulation.joint_lower, self.simulation.joint_upper
         self.command_space = command_space(lower.tolist(), upper.tolist())
         self.sampler = CommandSampler(self.command_space, device)
-        self.reference = Reference(config.reference, gains, self.control_period, device)
-        self.prior = None if config.prior is None else GaitPrior(config.prior, device)
+        followed = ReferenceConfig(gait_frequency=task.gait_frequency)
+        self.reference = Reference(followed, gains, self.control_period, device)
+        self.prior = None if task.prior is None else GaitPrior(task.prior, device)
         self.action_scale = torch.tensor(gains.action_scale, dtype=torch.float32, device=device)
-        self.randomizer = Randomizer(config.randomization, self.simulation, self.generator)
-        self.kind_probability = shares(config.mixture, device)
+        self.randomizer = Randomizer(task.randomization, self.simulation, self.generator)
+        self.kind_probability = shares(task.mixture, device)
         """Chance of each kind of command (kinds,); the curriculum moves it."""
         self.opening = torch.ones(len(KINDS), device=device)
         """How far each kind is open (kinds,), in [0, 1]; the curriculum moves it."""
-        self.tile_probability = tile_shares(config.terrain, device)
+        self.tile_probability = tile_shares(task.terrain, device)
         """Chance of each kind of tile (kinds of tile,); the curriculum moves it."""
         self.levels = Levels(self.world.terrain, config.num_robots, device)
         self._noise = config.noise.proprioception().to(device)
@@ -178,7 +168,7 @@ class PilotEnvironment:
         """Apply residual ``action`` (N, 29), in action scales, for one control step of 0.02 s."""
         buffers = self.buffers
         action = action.clamp(-self.config.action_limit, self.config.action_limit)
-        if not self.config.arms_act:
+        if not self.task.arms_act:
             action[:, ARM_JOINTS] = 0.0
         nominal_target = self.reference.joint_targets(buffers.reference)
         target = nominal_target + action * self.action_scale - self.randomizer.state.joint_offset
@@ -203,13 +193,13 @@ class PilotEnvironment:
             nominal_target=nominal_target,
             phase=buffers.reference.phase,
             walking=buffers.reference.walking,
-            gait_frequency=self.config.reference.gait_frequency,
+            gait_frequency=self.task.gait_frequency,
             foot_air_time=buffers.foot_air_time,
             foot_contact_time=buffers.foot_contact_time,
             mean_velocity_error=buffers.mean_velocity_error,
             fallen=fallen,
         )
-        reward, terms = compute_rewards(transition, self.config.rewards, self.control_period)
+        reward, terms = compute_rewards(transition, self.task.rewards, self.control_period)
         quality = tracking_quality(transition)
         command, kind, tile_kind = buffers.command, buffers.kind.clone(), buffers.tile_kind.clone()
         # The frozen controller goes by the policy's estimate of the capture point.
@@ -309,7 +299,7 @@ class PilotEnvironment:
         heading = self._uniform(-torch.pi, torch.pi, count)
         joint_spread = self._uniform(-0.02, 0.02, count, NUM_JOINTS)
         tile_kind, tile = self.levels.draw(ids, self.tile_probability, self.generator)
-        reach = 0.5 * self.config.terrain.tile_size - 1.0
+        reach = 0.5 * self.task.terrain.tile_size - 1.0
         xy = self.world.terrain.tile_centers[tile] + self._uniform(-reach, reach, count, 2)
         base_velocity = torch.zeros(count, 6, device=self.device)
         fastest = self.randomizer.config.start_velocity

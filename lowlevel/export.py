@@ -51,7 +51,7 @@ def export_controller(trainer: Trainer, folder: Path, revision: str | None = Non
         raise PilotError(f"no controller has the gait prior of the stage {trainer.stage.name!r}: train on")
     environment = trainer.environment
     config, pose = controller_config(environment), environment.reference.pose
-    policy = PolicyConfig(environment.config.reference, trainer.config.network, pose.axes)
+    policy = PolicyConfig(environment.reference.config, trainer.config.network, pose.axes)
     actor = PilotActor(actor_sizes(), policy.network, ~normalized_columns(FRAME))
     actor.load_state_dict({name: tensor.cpu() for name, tensor in trainer.ppo.actor.state_dict().items()})
     if not trainer.stage.arms_act:

@@ -85,8 +85,8 @@ EVERYTHING = (
 and holds both arms alike, as around a box."""
 
 UNEVEN = TerrainConfig(tiles=("flat", "rough"), levels=(1.0 / 3.0,), tile_size=8.0)
-"""Like the simple terrain of the paper: flat, and steps of up to 4 cm, made of a tenth of the blocks that the slabs of the
-evaluation take."""
+"""Like the simple terrain of the paper: flat, and steps of up to 4 cm, made of a tenth of the blocks that
+the slabs of the evaluation take."""
 
 SLOW_STEPS = 1.43
 """Gait frequency for a robot that learns to walk [Hz]: at 2 Hz the prior's legs, which follow late, turn the pelvis by
@@ -97,7 +97,7 @@ ANSWERS = GaitPriorConfig(lift=0.0, shift=0.0, stride=(0.0, 0.0, 0.0), balance=4
 
 STAGES = (
     Stage(
-        "balance",
+        name="balance",
         waits_for="curriculum/steps_between_falls/forward",
         above=150.0,
         most_steps=5_000_000,
@@ -111,7 +111,7 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
-        "walk",
+        name="walk",
         waits_for="curriculum/opening/forward",
         above=0.95,
         most_steps=6_000_000,
@@ -125,7 +125,7 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
-        "stride",
+        name="stride",
         waits_for="curriculum/quality/forward",
         above=0.55,
         most_steps=4_000_000,
@@ -136,7 +136,7 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
-        "steer",
+        name="steer",
         waits_for="curriculum/quality/steer",
         above=0.55,
         most_steps=6_000_000,
@@ -146,7 +146,7 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
-        "squat",
+        name="squat",
         waits_for="curriculum/opening/squat",
         above=0.98,
         most_steps=8_000_000,
@@ -157,7 +157,7 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
-        "bend and reach",
+        name="bend and reach",
         waits_for="curriculum/opening/stand_and_work",
         above=0.98,
         most_steps=15_000_000,
@@ -169,7 +169,7 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
-        "walk and work",
+        name="walk and work",
         waits_for="curriculum/steps_between_falls/stand_and_work",
         above=1500.0,
         least_steps=15_000_000,  # at first, in what is open by then, robots seldom fall
@@ -181,7 +181,7 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
-        "answer",
+        name="answer",
         most_steps=1_000_000,
         std=(0.2, 0.3),
         noise_at_rest=0.4,
@@ -191,7 +191,7 @@ STAGES = (
         randomization=GENTLE,
     ),
     Stage(
-        "carry",
+        name="carry",
         calibrates=True,
         waits_for="curriculum/hardness",
         above=0.98,
@@ -205,7 +205,7 @@ STAGES = (
         harder=HARD,
     ),
     Stage(
-        "harden",
+        name="harden",
         waits_for="curriculum/steps_between_falls/walk_and_work",
         above=2000.0,
         least_steps=5_000_000,
@@ -219,7 +219,7 @@ STAGES = (
         randomization=HARD,
     ),
     Stage(
-        "refine",
+        name="refine",
         std=(0.05, 0.08),
         rollout_doublings=2,
         arms_act=True,
@@ -251,7 +251,7 @@ CROSSING = (
 
 SEEING_STAGES = (
     Stage(
-        "climb",
+        name="climb",
         waits_for="curriculum/level/stairs",
         above=0.5,
         least_steps=10_000_000,
@@ -265,7 +265,7 @@ SEEING_STAGES = (
         randomization=replace(GENTLE, hand_load_probability=0.4),
     ),
     Stage(
-        "climb as seen",
+        name="climb as seen",
         waits_for="curriculum/hardness",
         above=0.98,
         most_steps=60_000_000,
@@ -279,7 +279,7 @@ SEEING_STAGES = (
         harder=HARD,
     ),
     Stage(
-        "refine",
+        name="refine",
         std=(0.05, 0.08),
         noise_at_rest=0.75,
         rollout_doublings=1,

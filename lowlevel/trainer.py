@@ -131,7 +131,7 @@ class Trainer:
         self.waited_for = 0.0
         stage = self.stage
         seed = self.config.seed + 7919 * rank() + 104729 * number
-        self.environment = PilotEnvironment(stage.environment(self.config.environment), seed=seed, device="cpu")
+        self.environment = PilotEnvironment(self.config.environment, stage, seed)
         self._shares, self._tile_shares = shares(stage.mixture), tile_shares(stage.terrain)
         acting = NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop
         self.ppo.enter(

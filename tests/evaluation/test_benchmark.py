@@ -12,6 +12,7 @@ from evaluation.benchmark import main
 from evaluation.speed.measurements import measure_environment, measure_latency, window_rates
 from evaluation.speed.plain_env import PlainMujocoEnv
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
+from lowlevel.task import TaskConfig
 
 
 def test_rates_count_work_per_second() -> None:
@@ -31,10 +32,9 @@ def test_the_shares_of_an_environment_step_add_up(resets: bool, monkeypatch: pyt
         num_robots=8,
         num_threads=1,
         start_moving=0.0,
-        mixture=(("stand", 1.0),),
         episode_length=0.04 if resets else 10.0,
     )
-    environment = PilotEnvironment(standing)  # nobody falls so soon
+    environment = PilotEnvironment(standing, TaskConfig(mixture=(("stand", 1.0),)))  # nobody falls so soon
     environment.reset()
     figures = measure_environment(environment, seconds=0.02)
     values = {name: figure.value for name, figure in figures.items()}

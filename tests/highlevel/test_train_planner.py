@@ -129,7 +129,7 @@ def test_a_run_resumed_while_it_records_does_not_train_on_the_demonstrations_epi
         return Demonstrations(trainer.source, observation, action, value, np.zeros(len(observation), np.int64), 1)
 
     monkeypatch.setattr(trainer, "_demonstrations", record)
-    trainer._imitate()
+    trainer._begin()
     trainer.vec_env.reset()
     assert trainer.environment.seed == TRAINING_SEED + config.seed
 

@@ -4,6 +4,7 @@ import inspect
 import math
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import pytest
@@ -26,6 +27,7 @@ from lowlevel.learning.ppo import PPOConfig
 from lowlevel.networks.actor import CAPTURE_POINT, MOTION_SIZE
 from lowlevel.rewards import REWARD_TERMS, RewardWeights
 from lowlevel.stages import Stage
+from lowlevel.task import TaskConfig
 from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.measures import TRACKING_FIGURES
 from lowlevel.world.privileged import MIRRORS, PRIVILEGED, PRIVILEGED_SIZE
@@ -34,13 +36,23 @@ from lowlevel.world.terrain import TerrainConfig
 from robots.rotations import rotate_about_vertical
 
 SMALL = EnvironmentConfig(num_robots=6, num_threads=1)
-QUIET = replace(
-    SMALL,
-    start_in_posture=0.0,
-    start_moving=0.0,
-    noise=NoiseConfig(0.0, 0.0, 0.0, 0.0, 0.0),
-    randomization=RandomizationConfig.for_evaluation(),
-)
+QUIET = replace(SMALL, start_in_posture=0.0, start_moving=0.0, noise=NoiseConfig(0.0, 0.0, 0.0, 0.0, 0.0))
+CALM = RandomizationConfig.for_evaluation()
+
+
+def small(seed: int = 0, **changes: Any) -> PilotEnvironment:
+    """A few robots; ``changes`` are of the environment's configuration or of its task."""
+    return _changed(SMALL, TaskConfig(arms_act=True), seed, changes)
+
+
+def quiet(seed: int = 0, **changes: Any) -> PilotEnvironment:
+    """A few robots that nothing disturbs."""
+    return _changed(QUIET, TaskConfig(arms_act=True, randomization=CALM), seed, changes)
+
+
+def _changed(config: EnvironmentConfig, task: TaskConfig, seed: int, changes: dict[str, Any]) -> PilotEnvironment:
+    of_task = {field.name: changes.pop(field.name) for field in fields(TaskConfig) if field.name in changes}
+    return PilotEnvironment(replace(config, **changes), replace(task, **of_task), seed)
 
 
 def roll_out(environment: PilotEnvironment, steps: int, scale: float = 0.3) -> list[torch.Tensor]:
@@ -55,7 +67,7 @@ def roll_out(environment: PilotEnvironment, steps: int, scale: float = 0.3) -> l
 
 
 def test_observations_have_the_announced_shapes_and_are_finite() -> None:
-    environment = PilotEnvironment(replace(SMALL, terrain=TerrainConfig(tiles=("flat", "irregular"))))
+    environment = small(terrain=TerrainConfig(tiles=("flat", "irregular")))
     observation = environment.reset()
     shapes = {name: tuple(value.shape) for name, value in observation.items()}
     history = FRAME_SIZE * (HISTORY_LENGTH + 1)
@@ -69,15 +81,15 @@ def test_observations_have_the_announced_shapes_and_are_finite() -> None:
 
 
 def test_same_seed_same_rollout_other_seed_other_rollout() -> None:
-    first = roll_out(PilotEnvironment(SMALL, seed=3), 20)
-    again = roll_out(PilotEnvironment(replace(SMALL, num_threads=2), seed=3), 20)
-    other = roll_out(PilotEnvironment(SMALL, seed=4), 20)
+    first = roll_out(small(3), 20)
+    again = roll_out(small(3, num_threads=2), 20)
+    other = roll_out(small(4), 20)
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not torch.equal(first[-1], other[-1])
 
 
 def test_restored_state_continues_bit_exactly() -> None:
-    environment = PilotEnvironment(replace(SMALL, terrain=TerrainConfig(tiles=("irregular",))), seed=5)
+    environment = small(5, terrain=TerrainConfig(tiles=("irregular",)))
     roll_out(environment, 15)
     saved = environment.state_dict()
     saved = {
@@ -86,7 +98,7 @@ def test_restored_state_continues_bit_exactly() -> None:
     }
     actions = 0.3 * torch.randn(40, 6, 29)
     expected = [environment.step(action) for action in actions]
-    other = PilotEnvironment(replace(SMALL, terrain=TerrainConfig(tiles=("irregular",))), seed=99)
+    other = small(99, terrain=TerrainConfig(tiles=("irregular",)))
     other.reset()
     other.load_state_dict(saved)
     for action, before in zip(actions, expected, strict=True):
@@ -96,15 +108,14 @@ def test_restored_state_continues_bit_exactly() -> None:
 
 
 def test_state_of_another_number_of_robots_is_refused() -> None:
-    saved = PilotEnvironment(SMALL).state_dict()
+    saved = small().state_dict()
     with pytest.raises(ValueError, match="number of robots"):
-        PilotEnvironment(replace(SMALL, num_robots=3)).load_state_dict(saved)
+        small(num_robots=3).load_state_dict(saved)
 
 
 def test_zero_action_stands_for_a_second_from_any_height_where_feet_do_not_slip() -> None:
     grip = replace(RandomizationConfig.for_evaluation(), friction=(1.0, 1.0))
-    config = replace(QUIET, num_robots=16, start_in_posture=1.0, randomization=grip, mixture=(("squat", 1.0),))
-    environment = PilotEnvironment(config, seed=2)
+    environment = quiet(2, num_robots=16, start_in_posture=1.0, randomization=grip, mixture=(("squat", 1.0),))
     environment.reset()
     results = [environment.step(torch.zeros(16, 29)) for _ in range(50)]
     assert not torch.stack([result.terminated for result in results]).any()
@@ -113,8 +124,8 @@ def test_zero_action_stands_for_a_second_from_any_height_where_feet_do_not_slip(
 
 
 def test_friction_of_the_feet_is_the_one_that_was_drawn() -> None:
-    slippery = replace(QUIET.randomization, friction=(0.4, 0.5))
-    environment = PilotEnvironment(replace(QUIET, randomization=slippery, mixture=(("stand", 1.0),)))
+    slippery = replace(CALM, friction=(0.4, 0.5))
+    environment = quiet(randomization=slippery, mixture=(("stand", 1.0),))
     environment.reset()
     for _ in range(10):  # until the feet have landed
         environment.step(torch.zeros(6, 29))
@@ -127,7 +138,7 @@ def test_friction_of_the_feet_is_the_one_that_was_drawn() -> None:
 
 
 def test_targets_reach_the_motors_as_late_as_drawn() -> None:
-    environment = PilotEnvironment(SMALL)
+    environment = small()
     environment.reset()
     environment.randomizer.state.delay = torch.tensor([0, 1, 2, 0, 1, 2])
     sent = [torch.full((6, 29), float(number)) for number in range(4)]
@@ -137,7 +148,7 @@ def test_targets_reach_the_motors_as_late_as_drawn() -> None:
 
 def test_maps_are_refreshed_at_10_hz_and_arrive_as_late_and_as_wrong_as_drawn() -> None:
     stairs = TerrainConfig(tiles=("stairs",), levels=(1.0,))
-    environment = PilotEnvironment(replace(QUIET, terrain=stairs))
+    environment = quiet(terrain=stairs)
     environment.reset()
     drawn = environment.randomizer.state
     drawn.map_delay = torch.tensor([0, 0, 1, 1, 2, 2])
@@ -158,7 +169,7 @@ def test_maps_are_refreshed_at_10_hz_and_arrive_as_late_and_as_wrong_as_drawn() 
 
 
 def test_the_error_of_a_map_wanders_within_its_bounds() -> None:
-    environment = PilotEnvironment(SMALL)
+    environment = small()
     environment.reset()
     randomizer, limit = environment.randomizer, environment.randomizer.config.map_drift
     first = randomizer.state.map_error.clone()
@@ -173,7 +184,7 @@ def test_the_error_of_a_map_wanders_within_its_bounds() -> None:
 
 
 def test_waist_motors_are_as_strong_as_drawn() -> None:
-    environment = PilotEnvironment(replace(SMALL, randomization=RandomizationConfig(waist_effort=(35.0, 36.0))))
+    environment = small(randomization=RandomizationConfig(waist_effort=(35.0, 36.0)))
     environment.reset()
     model = environment.simulation.robot_model(3)
     limits = {
@@ -184,22 +195,21 @@ def test_waist_motors_are_as_strong_as_drawn() -> None:
 
 
 def test_arms_that_do_not_act_follow_the_command_alone() -> None:
-    environment = PilotEnvironment(replace(QUIET, arms_act=False))
+    environment = quiet(arms_act=False)
     environment.reset()
     environment.step(torch.ones(6, 29))
     assert (environment.buffers.action[:, 15:] == 0.0).all() and (environment.buffers.action[:, :15] == 1.0).all()
 
 
 def test_a_share_of_the_episodes_starts_at_the_told_velocity() -> None:
-    config = replace(QUIET, num_robots=64, mixture=(("walk", 1.0),), start_moving=1.0)
-    environment = PilotEnvironment(config)
+    environment = quiet(num_robots=64, mixture=(("walk", 1.0),), start_moving=1.0)
     environment.reset()
     measured = environment.world.measure()
     torch.testing.assert_close(measured.linear_velocity[:, :2], environment.buffers.command[:, :2], atol=1e-4, rtol=0.0)
 
 
 def test_falls_terminate_and_time_limits_truncate() -> None:
-    environment = PilotEnvironment(replace(QUIET, episode_length=0.2))
+    environment = quiet(episode_length=0.2)
     environment.reset()
     for _ in range(9):
         result = environment.step(torch.zeros(6, 29))
@@ -207,14 +217,14 @@ def test_falls_terminate_and_time_limits_truncate() -> None:
     result = environment.step(torch.zeros(6, 29))
     assert result.truncated.all() and not result.terminated.any()
     assert (environment.buffers.episode_step == 0).all()
-    toppled = PilotEnvironment(QUIET)
+    toppled = quiet()
     toppled.reset()
     everything = [toppled.step(torch.full((6, 29), 8.0)) for _ in range(60)]
     assert torch.stack([result.terminated for result in everything]).any(dim=0).all()
 
 
 def test_a_step_says_whether_another_command_follows() -> None:
-    environment = PilotEnvironment(replace(QUIET, num_robots=64, command_interval=(0.1, 0.4)))
+    environment = quiet(num_robots=64, command_interval=(0.1, 0.4))
     environment.reset()
     for _ in range(10):
         before = environment.buffers.command
@@ -226,8 +236,8 @@ def test_a_step_says_whether_another_command_follows() -> None:
 
 
 def test_a_step_says_whether_a_push_follows() -> None:
-    pushes = replace(QUIET.randomization, push_velocity=0.5, push_interval=(0.04, 0.1))
-    environment = PilotEnvironment(replace(QUIET, num_robots=16, command_interval=(9.0, 9.1), randomization=pushes))
+    pushes = replace(CALM, push_velocity=0.5, push_interval=(0.04, 0.1))
+    environment = quiet(num_robots=16, command_interval=(9.0, 9.1), randomization=pushes)
     environment.reset()
     surprised = torch.zeros(16, dtype=torch.bool)
     for _ in range(5):
@@ -242,7 +252,7 @@ def test_a_step_says_whether_a_push_follows() -> None:
 
 
 def test_a_standing_robot_that_is_pushed_steps() -> None:
-    environment = PilotEnvironment(replace(QUIET, command_interval=(9.0, 9.1), mixture=(("stand", 1.0),)))
+    environment = quiet(command_interval=(9.0, 9.1), mixture=(("stand", 1.0),))
     environment.reset()
     assert not environment.buffers.reference.walking.any()
     push = torch.tensor([[0.1, 0, 0], [0.6, 0, 0], [-0.6, 0, 0], [0, 0.6, 0], [0, -0.6, 0], [0, 0, 0]])
@@ -256,11 +266,10 @@ def test_a_standing_robot_that_is_pushed_steps() -> None:
 
 
 def test_robots_start_just_above_the_ground_as_fast_as_configured() -> None:
-    config = replace(QUIET, num_robots=64, terrain=TerrainConfig(tiles=("irregular",)))
+    slabs = TerrainConfig(tiles=("irregular",))
     for fastest in (0.0, 0.3):
-        environment = PilotEnvironment(
-            replace(config, randomization=replace(QUIET.randomization, start_velocity=fastest))
-        )
+        started = replace(CALM, start_velocity=fastest)
+        environment = quiet(num_robots=64, terrain=slabs, randomization=started)
         environment.reset()
         state = environment.simulation.read()
         soles = state.foot_position
@@ -270,7 +279,7 @@ def test_robots_start_just_above_the_ground_as_fast_as_configured() -> None:
 
 
 def test_successor_state_is_the_one_before_the_reset() -> None:
-    environment = PilotEnvironment(replace(QUIET, episode_length=0.1))
+    environment = quiet(episode_length=0.1)
     environment.reset()
     for _ in range(5):
         result = environment.step(0.5 * torch.ones(6, 29))
@@ -282,7 +291,7 @@ def test_successor_state_is_the_one_before_the_reset() -> None:
 
 def test_no_part_of_an_observation_is_constant() -> None:
     """Blocks that never change would be dead inputs; the ones that may are named."""
-    environment = PilotEnvironment(replace(SMALL, num_robots=32))
+    environment = small(num_robots=32)
     frames = torch.stack(
         [values[:, : FRAME_SIZE * (HISTORY_LENGTH + 1)][:, -FRAME_SIZE:] for values in roll_out(environment, 60)]
     )
@@ -292,7 +301,7 @@ def test_no_part_of_an_observation_is_constant() -> None:
 
 
 def test_mirrors_cover_their_vectors() -> None:
-    environment = PilotEnvironment(SMALL)
+    environment = small()
     observation = environment.reset()
     for key in ("history", "elevation_map", "privileged"):
         values = observation[key].numpy()
@@ -301,7 +310,7 @@ def test_mirrors_cover_their_vectors() -> None:
 
 
 def test_a_robot_that_diverges_falls_and_the_others_do_not_notice() -> None:
-    environment, undisturbed = PilotEnvironment(QUIET, seed=2), PilotEnvironment(QUIET, seed=2)
+    environment, undisturbed = quiet(2), quiet(2)
     environment.reset(), undisturbed.reset()
     environment.simulation._qvel[3, 10] = float("nan")
     for step in range(3):
@@ -330,7 +339,7 @@ def test_frozen_controller_repeats_the_training_policy(tmp_path: Path, monkeypat
     """Controller.act on noise-free measurements gives the targets that the environment applies."""
     # An untrained policy's estimate of its capture point says nothing about when to step.
     monkeypatch.setattr("lowlevel.control.stepping.FARTHEST", math.inf)
-    stage = Stage(arms_act=True, randomization=QUIET.randomization)
+    stage = Stage(arms_act=True, randomization=CALM)
     config = TrainingConfig(environment=QUIET, ppo=PPOConfig(steps_per_update=8, minibatches=2), stages=(stage,))
     trainer = Trainer(config, tmp_path)
     generator = torch.Generator().manual_seed(0)
@@ -356,7 +365,7 @@ def test_frozen_controller_repeats_the_training_policy(tmp_path: Path, monkeypat
 
 
 def test_tracking_figures_vanish_for_a_robot_that_does_as_told() -> None:
-    environment = PilotEnvironment(QUIET)
+    environment = quiet()
     environment.opening = torch.zeros(len(KINDS))
     environment.reset()
     measured = environment.world.measure()
@@ -375,11 +384,11 @@ def test_the_history_encoder_estimates_what_the_critics_view_begins_with() -> No
 
 
 def test_a_load_ends_with_its_episode_when_conditions_get_easier_again() -> None:
-    loaded = replace(QUIET.randomization, hand_load_probability=1.0, hand_payload=(10.0, 10.0))
-    environment = PilotEnvironment(replace(QUIET, randomization=loaded, episode_length=0.1))
+    loaded = replace(CALM, hand_load_probability=1.0, hand_payload=(10.0, 10.0))
+    environment = quiet(randomization=loaded, episode_length=0.1)
     environment.reset()
     environment.step(torch.zeros(6, 29))
-    environment.randomizer.config = QUIET.randomization
+    environment.randomizer.config = CALM
     environment.step(torch.zeros(6, 29))
     assert (environment.buffers.hand_force.norm(dim=-1) > 1.0).all(), "until the episode is over it is still there"
     for _ in range(5):

@@ -5,6 +5,7 @@ import torch
 
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
 from lowlevel.levels import CROSSED, LARGEST_ERROR, Levels
+from lowlevel.task import TaskConfig
 from lowlevel.world.terrain import TILES, Terrain, TerrainConfig
 
 NAMES = list(TILES)
@@ -67,7 +68,7 @@ def test_relief_is_what_a_line_across_the_stairs_climbs() -> None:
 
 def test_an_environment_counts_what_its_robots_climb() -> None:
     terrain = TerrainConfig(tiles=("stairs",), levels=LEVELS)
-    environment = PilotEnvironment(EnvironmentConfig(num_robots=8, num_threads=1, terrain=terrain))
+    environment = PilotEnvironment(EnvironmentConfig(num_robots=8, num_threads=1), TaskConfig(terrain=terrain))
     environment.reset()
     buffers = environment.buffers
     assert (buffers.tile_kind == NAMES.index("stairs")).all() and (buffers.tile == 0).all()
@@ -79,7 +80,7 @@ def test_an_environment_counts_what_its_robots_climb() -> None:
     going_on = buffers.episode_step == 20
     assert going_on.any()
     assert torch.allclose(buffers.climbed[going_on], climbed[going_on])
-    resumed = PilotEnvironment(environment.config, seed=5)
+    resumed = PilotEnvironment(environment.config, environment.task, seed=5)
     resumed.reset()
     environment.levels.reached[:] = 2
     resumed.load_state_dict(environment.state_dict())
@@ -88,8 +89,8 @@ def test_an_environment_counts_what_its_robots_climb() -> None:
 
 def test_a_mastered_level_leads_to_the_next_tile(monkeypatch: pytest.MonkeyPatch) -> None:
     terrain = TerrainConfig(tiles=("stairs",), levels=LEVELS)
-    config = EnvironmentConfig(num_robots=4, num_threads=1, terrain=terrain, episode_length=0.1)
-    environment = PilotEnvironment(config)
+    config = EnvironmentConfig(num_robots=4, num_threads=1, episode_length=0.1)
+    environment = PilotEnvironment(config, TaskConfig(terrain=terrain))
     environment.reset()
     monkeypatch.setattr("lowlevel.levels.CROSSED", 0.0)
     for _ in range(5):

@@ -23,8 +23,8 @@ from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.randomization import RandomizationConfig
 
 QUICK = CloningConfig(rounds=2, steps=4, mixed_rounds=1, gradient_steps=2, minibatch=16)
-FIRST = Stage("first", "reward/alive", above=0.1, least_steps=0, std=(0.2, 0.3), prior=GaitPriorConfig())
-SECOND = Stage("second", std=(0.05, 0.1), rollout_doublings=1, arms_act=True, mixture=(("walk", 1.0),))
+FIRST = Stage(name="first", waits_for="reward/alive", above=0.1, least_steps=0, std=(0.2, 0.3), prior=GaitPriorConfig())
+SECOND = Stage(name="second", std=(0.05, 0.1), rollout_doublings=1, arms_act=True, mixture=(("walk", 1.0),))
 
 
 def tiny(*stages: Stage) -> TrainingConfig:
@@ -43,7 +43,7 @@ def test_the_next_stage_begins_when_its_figure_is_reached(tmp_path: Path) -> Non
     trainer.train()
     assert trainer.stage.name == "second"
     environment = trainer.environment
-    assert environment.prior is None and environment.config.arms_act
+    assert environment.prior is None and environment.task.arms_act
     assert set(environment.buffers.kind.tolist()) == {list(KINDS).index("walk")}
     assert trainer.ppo.storage.steps == 16
     assert float(trainer.ppo.actor.log_std.exp().max()) <= 0.1 + 1e-6
@@ -84,11 +84,11 @@ def test_a_resumed_run_goes_on_in_its_stage(tmp_path: Path) -> None:
 def test_absorption_teaches_the_policy_what_the_prior_did(tmp_path: Path) -> None:
     """Walking on the spot by the prior alone: after absorption the policy does the same without it."""
     walking = Stage(
-        "walk", prior=GaitPriorConfig(), mixture=(("walk", 1.0),), randomization=RandomizationConfig.for_evaluation()
+        prior=GaitPriorConfig(), mixture=(("walk", 1.0),), randomization=RandomizationConfig.for_evaluation()
     )
     config = replace(tiny(walking), environment=EnvironmentConfig(num_robots=32, num_threads=1))
     trainer = Trainer(config, tmp_path)
-    alone = PilotEnvironment(replace(trainer.environment.config, prior=None), seed=1)
+    alone = PilotEnvironment(trainer.environment.config, replace(trainer.environment.task, prior=None), seed=1)
     prior = GaitPrior(GaitPriorConfig())
     progress: list[float] = []
     settings = CloningConfig(rounds=12, mixed_rounds=6, minibatch=256, learning_rate=3e-3)

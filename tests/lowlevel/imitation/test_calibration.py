@@ -24,7 +24,7 @@ from lowlevel.stages import Stage
 from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.randomization import RandomizationConfig
 
-WALKING = Stage("walk", mixture=(("walk", 1.0),), rewards=RewardWeights(alive=1.0))
+WALKING = Stage(name="walk", mixture=(("walk", 1.0),), rewards=RewardWeights(alive=1.0))
 
 
 def small(*stages: Stage, robots: int = 8) -> TrainingConfig:
