@@ -54,6 +54,10 @@ class PhysicsConfig:
     """Physics step [s]."""
     solver_iterations: int = 12
     """Newton iterations per step."""
+    line_search_iterations: int = 20
+    """Of the line search in each of them."""
+    impratio: float = 10.0
+    """How much stiffer friction is than contact."""
     num_threads: int = 2
     """Physics threads."""
     mjcf: Annotated[Path | None, tyro.conf.Suppress] = None
@@ -126,6 +130,8 @@ class CommandEnvironment:
             timestep=physics.timestep,
             elliptic_friction=True,
             solver_iterations=physics.solver_iterations,
+            line_search_iterations=physics.line_search_iterations,
+            impratio=physics.impratio,
             mjcf=physics.mjcf,
         )
         self.world = World(options, TerrainConfig(), num_envs, physics.num_threads, add_objects=task.add_to)

@@ -17,6 +17,7 @@ from highlevel.registry import find_controller, load_task
 from highlevel.task import Task
 from lowlevel.commands import COMMAND_SIZE
 from lowlevel.control.controller import Controller
+from lowlevel.runs.draws import require_seed
 
 PICTURE_SIZE = (640, 480)
 """Width and height of rendered pictures [pixels]."""
@@ -70,8 +71,14 @@ class PlannerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin the first episode of ``seed``, or the next episode; without any seed so far, of a random one.
 
-        There are no ``options``.
+        Raises:
+            ValueError: if there are ``options``, of which it has none.
+            PilotError: if the seed is negative or above 2^63 - 1.
         """
+        if options:
+            raise ValueError(f"there is no option {next(iter(options))!r} to reset with")
+        if seed is not None:
+            require_seed(seed)
         super().reset(seed=seed)
         if seed is None and self.environment.measured is None:
             # Workers that nobody seeds must not all run the same episodes.
@@ -81,11 +88,18 @@ class PlannerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return observation[0].numpy(), {"episode_number": int(self.environment.episode[0])}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One decision of 0.1 s. Nothing is ever truncated: running out of time, which is observed, terminates."""
+        """One decision of 0.1 s. Nothing is ever truncated: running out of time, which is observed, terminates.
+
+        Raises:
+            RuntimeError: if the episode is over.
+            ValueError: if the action has another shape, or is not finite.
+        """
         if self._is_over:
             raise RuntimeError("the episode is over: call reset() before step()")
-        action_tensor = torch.as_tensor(np.asarray(action, dtype=np.float32))[None]
-        result = self.environment.step(action_tensor, auto_reset=False)
+        numbers = np.asarray(action, dtype=np.float32)
+        if numbers.shape != self.action_space.shape:
+            raise ValueError(f"the action has the shape {numbers.shape}, but it must be {self.action_space.shape}")
+        result = self.environment.step(torch.as_tensor(numbers)[None], auto_reset=False)
         self._is_over = bool(result.done[0])
         info: dict[str, Any] = {"stage": int(result.final_stage[0]), "is_success": bool(result.success[0])}
         if self._is_over:

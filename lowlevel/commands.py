@@ -83,8 +83,9 @@ class CommandKind:
     """Ranges of roll, pitch and yaw [rad]."""
     arms: bool = False
     """Whether the arms move; they hang at their default otherwise."""
-    arms_alike: bool = False
-    """Whether the right arm does the mirror image of what the left one does."""
+    left_arm: tuple[tuple[float, float], ...] | None = None
+    """Ranges of the left arm's seven joints [rad], whose mirror image the right arm does; None: each of the 14 joints
+    by itself, anywhere (Eq. 2-3)."""
     tracks: bool = False
     """The tracking flag I."""
     steering: float = 1.0
@@ -97,6 +98,7 @@ _WALKING_TORSO = ((-0.2, 0.2), (-0.2, 0.5), (-0.5, 0.5))
 WALKING_POSTURE = (_WALKING_HEIGHT, *_WALKING_TORSO)
 """Ranges of height [m] and torso roll, pitch, yaw [rad] in which robots walk."""
 _TORSO = ((-0.4, 0.4), (-0.3, 1.5), (-1.5, 1.5))
+_BEFORE_THE_CHEST = ((-1.6, 0.0), (0.0, 0.5), (-0.3, 0.5), (-0.2, 1.2), (-0.6, 0.6), (-0.4, 0.8), (-0.4, 0.4))
 
 KINDS: dict[str, CommandKind] = {
     "stand": CommandKind(),
@@ -108,9 +110,11 @@ KINDS: dict[str, CommandKind] = {
     "walk_and_work": CommandKind(_VELOCITY, height=_WALKING_HEIGHT, torso=_WALKING_TORSO, arms=True, tracks=True),
     "stand_and_work": CommandKind(height=(0.30, 0.76), torso=_TORSO, arms=True, tracks=True),
     "walk_and_hold": CommandKind(
-        _VELOCITY, height=_WALKING_HEIGHT, torso=_WALKING_TORSO, arms=True, arms_alike=True, tracks=True
+        _VELOCITY, _WALKING_HEIGHT, _WALKING_TORSO, arms=True, left_arm=_BEFORE_THE_CHEST, tracks=True
     ),
-    "stand_and_hold": CommandKind(height=(0.30, 0.76), torso=_TORSO, arms=True, arms_alike=True, tracks=True),
+    "stand_and_hold": CommandKind(
+        height=(0.30, 0.76), torso=_TORSO, arms=True, left_arm=_BEFORE_THE_CHEST, tracks=True
+    ),
 }
 """Kinds of command by name. Training draws few at a time: over the whole command space the policy gradient is nearly
 all noise. Arms that are drawn one by one seldom both reach forwards, as those of a robot that holds a box do."""
@@ -136,10 +140,10 @@ class CommandSampler:
         boxes = column(lambda kind: (*kind.velocity, kind.height, *kind.torso))
         self._low, self._high = boxes.unbind(-1)
         self._arms, self._tracks = column(lambda kind: kind.arms), column(lambda kind: kind.tracks)
-        self._arms_alike = column(lambda kind: kind.arms_alike) > 0.0
-        self._is_right = torch.tensor([name.startswith("right") for name in space.names[ARMS]], device=device)
-        self._partner = torch.tensor(ARMS_MIRROR.index, device=device)
-        self._sign = torch.tensor(ARMS_MIRROR.sign, dtype=torch.float32, device=device)
+        self._holds = column(lambda kind: kind.left_arm is not None) > 0.0
+        nowhere = ((0.0, 0.0),) * len(_BEFORE_THE_CHEST)
+        self._left_low, self._left_high = column(lambda kind: kind.left_arm or nowhere).unbind(-1)
+        self._right_sign = torch.tensor(ARMS_MIRROR.sign[len(nowhere) :], dtype=torch.float32, device=device)
         self._steering = column(lambda kind: kind.steering)
 
     def draw_kinds(self, count: int, probabilities: Tensor, generator: torch.Generator) -> Tensor:
@@ -164,8 +168,11 @@ class CommandSampler:
         wanted[:, 1:3] *= uniform(count, 2) < self._steering[kinds, None]
         neutral = self.neutral[: ARMS.start]
         arms = self._sample_arms(count, (open_to * self._arms[kinds, None]), generator)
-        follows = self._arms_alike[kinds, None] & self._is_right
-        arms = torch.where(follows, arms[:, self._partner] * self._sign, arms)
+        holds = self._holds[kinds]
+        left_low, left_high = self._left_low[kinds[holds]], self._left_high[kinds[holds]]
+        left = left_low + uniform(*left_low.shape) * (left_high - left_low)
+        both = torch.cat([left, left * self._right_sign], dim=1)
+        arms[holds] = self.neutral[ARMS] + open_to[holds] * (both - self.neutral[ARMS])
         command = torch.cat([neutral + open_to * (wanted - neutral), arms], dim=1)
         stands = command[:, VELOCITY].norm(dim=-1) < STANDING_SPEED
         command[stands, VELOCITY] = 0.0

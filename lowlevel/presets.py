@@ -77,12 +77,12 @@ EVERYTHING = (
     ("slow", 0.08),
     ("stand", 0.05),
     ("stand_and_work", 0.2),
-    ("stand_and_hold", 0.1),
-    ("walk_and_work", 0.35),
+    ("stand_and_hold", 0.15),
+    ("walk_and_work", 0.3),
     ("walk_and_hold", 0.1),
 )
 """Unlike the evaluation it also stands in the neutral posture, what a planner starts from and stops in, walks slowly,
-and holds both arms alike, as around a box."""
+and holds both arms before its chest, as around a box."""
 
 UNEVEN = TerrainConfig(tiles=("flat", "rough"), levels=(1.0 / 3.0,), tile_size=8.0)
 """Like the simple terrain of the paper: flat, and steps of up to 4 cm, made of a tenth of the blocks that
@@ -209,9 +209,9 @@ STAGES = (
         calibrates=True,  # what a robot answers in much noise is not what it answers in little
         waits_for="curriculum/hardness",
         above=0.95,
-        least_steps=5_000_000,
+        least_steps=8_000_000,
         most_steps=15_000_000,
-        std=(0.1, 0.15),
+        std=(0.1, 0.1),
         noise_at_rest=0.6,
         mixture=EVERYTHING,
         rewards=EXACT,

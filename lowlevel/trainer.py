@@ -29,6 +29,7 @@ from lowlevel.learning.ppo import PPO, PPOConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes
 from lowlevel.networks.sight import give_sight
 from lowlevel.runs.distributed import any_rank, average_over_ranks, rank, world_size
+from lowlevel.runs.draws import require_seed
 from lowlevel.runs.interrupts import stop_on_signals
 from lowlevel.runs.progress import ProgressReport
 from lowlevel.runs.run_folder import RunFolder
@@ -100,6 +101,7 @@ class Trainer:
     """Trains one controller in ``folder``; everything needed to continue is in its ``training_state.pt``."""
 
     def __init__(self, config: TrainingConfig, folder: Path) -> None:
+        require_seed(config.seed)
         self.config = config
         self.run = RunFolder(folder)
         self.curriculum = Curriculum(config.curriculum)
@@ -153,17 +155,22 @@ class Trainer:
         if hard is not None:
             self.environment.randomizer.config = between(easy, hard, float(self.curriculum.hardness))
 
-    def _follow_stages(self, figures: dict[str, float], report: Callable[[str], None]) -> None:
-        """Begin the next stage once the figure that this one waits for is reached, or its steps are used up."""
+    def _stage_is_over(self, figures: dict[str, float]) -> bool:
+        """Whether the figure that this stage waits for is reached, or its steps are used up; never of the last stage.
+
+        ``figures`` of the last update enter the average that is waited for.
+        """
         stage = self.stage
-        if self.stage_number + 1 == len(self.config.stages):
-            return
         if stage.waits_for:
             self.waited_for += 0.1 * (figures[stage.waits_for] - self.waited_for)
+        if self.stage_number + 1 == len(self.config.stages):
+            return False
         taken = self.steps - self.stage_begin
         reached = bool(stage.waits_for) and self.waited_for > stage.above and taken >= stage.least_steps
-        if not reached and taken < stage.most_steps:
-            return
+        return reached or taken >= stage.most_steps
+
+    def _enter_next_stage(self, report: Callable[[str], None]) -> None:
+        """Begin the next stage, and ``report`` how far what is to be cloned or calibrated first has come."""
         self.save()
         prior, upcoming = self.environment.prior, self.config.stages[self.stage_number + 1]
         self.curriculum.introduce((shares(upcoming.mixture) > 0.0) & (self._shares == 0.0))
@@ -202,7 +209,8 @@ class Trainer:
                 if rank() == 0:
                     self.run.log(figures, self.trained_seconds, "steps", self.steps)
                 started = time.monotonic()
-                self._follow_stages(figures, progress.say)
+                if self._stage_is_over(figures):
+                    self._enter_next_stage(progress.say)
                 self.trained_seconds += time.monotonic() - started
                 progress.update(task, completed=self.steps, description=self._headline(figures))
                 if time.monotonic() - last_save > self.config.save_interval:

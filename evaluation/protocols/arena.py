@@ -19,8 +19,9 @@ from lowlevel.commands import COMMAND_SIZE, VELOCITY, clamp_posture, command_spa
 from lowlevel.control.elevation_map import MAP_SIZE
 from lowlevel.control.observation import MAP_REFRESH_STEPS, NoiseConfig
 from lowlevel.control.whole_body import HasExperts, Supports, WholeBodyController
+from lowlevel.runs.draws import require_seed
 from lowlevel.world.measures import Measurement
-from lowlevel.world.randomization import RandomizationConfig, Randomizer
+from lowlevel.world.randomization import RandomizationConfig, Randomizer, hand_forces
 from lowlevel.world.terrain import TerrainConfig
 from lowlevel.world.world import World
 from robots.g1.constants import NUM_JOINTS
@@ -134,7 +135,12 @@ class Moment:
 
 
 def episode_seeds(seed: int, index: int) -> tuple[int, int]:
-    """Two independent seeds for episode ``index`` of an evaluation: for its commands and for its world."""
+    """Two independent seeds for episode ``index`` of an evaluation: for its commands and for its world.
+
+    Raises:
+        PilotError: if ``seed`` is none.
+    """
+    require_seed(seed)
     commands, world = np.random.SeedSequence([seed, index]).generate_state(2)
     return int(commands), int(world)
 
@@ -142,19 +148,6 @@ def episode_seeds(seed: int, index: int) -> tuple[int, int]:
 def constant(seed: int, duration: float, command: Tensor, flag: float, tile: int = 0) -> Episode:
     """An episode with one ``command`` (21,) throughout."""
     return Episode(seed, duration, (0.0,), command[None], torch.tensor([flag]), tile)
-
-
-def hand_forces(palm_position: Tensor, outward: Tensor, downward: Tensor) -> Tensor:
-    """Forces on left and right hand (N, 2, 3) [N], world frame.
-
-    ``palm_position`` (N, 2, 3) [m]; ``outward`` (N,) along the line between the palms and ``downward`` (N,) are
-    per hand [N].
-    """
-    across = palm_position[:, 0] - palm_position[:, 1]
-    to_the_left = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-3)
-    force = torch.stack([to_the_left, -to_the_left], dim=1) * outward[:, None, None]
-    force[..., 2] -= downward[:, None]
-    return force
 
 
 class Arena:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from evaluation.protocols.arena import Arena, Episode
 from evaluation.protocols.tracking import TILE_SIZE, CommandTable, protocol_episodes, run_tracking
 from evaluation.reporting.statistics import Figure
 from lowlevel.commands import CommandSpace
-from lowlevel.world.measures import TRACKING_FIGURES
 from lowlevel.world.terrain import TerrainConfig
 from robots.errors import PilotError
 
@@ -25,12 +24,12 @@ class Suite:
     """What ``evaluate-lowlevel --suite`` names."""
 
     terrain: TerrainConfig
-    crosses: bool
-    """Whether robots cross the tiles, or walk about on them."""
-    paper: dict[str, float]
-    """Figures of the paper's Table II, by name."""
-    paper_row: str
+    paper: dict[str, float] = field(default_factory=dict)
+    """Figures that the paper reports on such ground (Table II), by name."""
+    paper_row: str = ""
     """Which row of it."""
+    crosses: bool = False
+    """Whether robots cross the tiles, or walk about on them."""
 
     def episodes(self, space: CommandSpace, count: int, seed: int) -> list[Episode]:
         """The fixed episodes of an evaluation."""
@@ -47,25 +46,30 @@ class Suite:
         return *run_tracking(arena, episodes, advance), {}
 
 
-def _paper(*values: float) -> dict[str, float]:
-    return dict(zip(TRACKING_FIGURES, values, strict=False))
-
-
-def _simple(*tiles: str) -> Suite:
-    blind = _paper(0.145, 0.099, 0.010, 0.057, 0.053, 0.055, 0.206)
-    return Suite(TerrainConfig(tiles=tiles, tile_size=TILE_SIZE), crosses=False, paper=blind, paper_row="blind")
-
-
+BLIND_ON_SIMPLE_GROUND = {
+    "E_v": 0.145,
+    "E_omega": 0.099,
+    "E_h": 0.010,
+    "E_r": 0.057,
+    "E_p": 0.053,
+    "E_y": 0.055,
+    "E_arm": 0.206,
+}
+PILOT_ON_COMPLEX_GROUND = {
+    "E_v": 0.148,
+    "E_omega": 0.102,
+    "E_h": 0.009,
+    "E_r": 0.055,
+    "E_p": 0.056,
+    "E_y": 0.068,
+    "E_arm": 0.218,
+    "E_stumble": 0.006,
+}
 SUITES: dict[str, Suite] = {
-    "simple": _simple("flat", "irregular"),
-    "flat": _simple("flat"),
-    "slabs": _simple("irregular"),
-    "full": Suite(
-        crossing.TERRAIN,
-        crosses=True,
-        paper=_paper(0.148, 0.102, 0.009, 0.055, 0.056, 0.068, 0.218, 0.006),
-        paper_row="PILOT, complex terrain",
-    ),
+    "simple": Suite(TerrainConfig(("flat", "irregular"), tile_size=TILE_SIZE), BLIND_ON_SIMPLE_GROUND, "blind"),
+    "flat": Suite(TerrainConfig(("flat",), tile_size=TILE_SIZE)),
+    "slabs": Suite(TerrainConfig(("irregular",), tile_size=TILE_SIZE)),
+    "full": Suite(crossing.TERRAIN, PILOT_ON_COMPLEX_GROUND, "PILOT, complex terrain", crosses=True),
 }
 
 

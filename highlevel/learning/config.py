@@ -110,6 +110,8 @@ class PlannerTrainingConfig:
         for name, count in counts.items():
             if count < 1:
                 raise PilotError(f"{name} is {count}, but it must be at least 1")
+        if not 0 <= self.seed < 2**31:
+            raise PilotError(f"seed is {self.seed}, but it must be between 0 and 2^31 - 1")
         if not 0.0 <= self.cloning.held_out < 1.0:
             raise PilotError(f"cloning.held_out is {self.cloning.held_out}, but it must be at least 0 and below 1")
         if not self.network.hidden or min(self.network.hidden) < 1:

@@ -40,11 +40,11 @@ class ReferenceConfig:
     """Slew rate of the velocity away from zero [m/s^2] and [rad/s^2]."""
     braking_rate: float = 1.5
     """Slew rate of the velocity towards zero [m/s^2] and [rad/s^2]: it takes two steps to stop."""
-    height_rate: float = 0.4
+    height_rate: float = 0.5
     """Slew rate of the base height [m/s]."""
-    torso_rate: tuple[float, float, float] = (0.8, 0.8, 1.5)
+    torso_rate: tuple[float, float, float] = (1.2, 1.2, 2.0)
     """Slew rates of the torso's roll, pitch and yaw [rad/s]; yaw hardly moves the center of mass."""
-    arm_rate: float = 4.0
+    arm_rate: float = 8.0
     """Slew rate of the arm joints [rad/s]."""
 
 

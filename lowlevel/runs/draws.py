@@ -12,6 +12,7 @@ from torch import Tensor
 
 from robots.errors import PilotError
 
+MOST_SEED = 2**63 - 1
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -20,6 +21,16 @@ def _mix(values: np.ndarray) -> np.ndarray:
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return values ^ (values >> np.uint64(31))
+
+
+def require_seed(seed: int) -> None:
+    """Check that ``seed`` is one for every generator here.
+
+    Raises:
+        PilotError: if it is negative or above MOST_SEED.
+    """
+    if not 0 <= seed <= MOST_SEED:
+        raise PilotError(f"the seed is {seed}, but it must be between 0 and 2^63 - 1")
 
 
 def uniform(seed: int, episode: Tensor, stream: int, count: int) -> Tensor:
@@ -32,10 +43,9 @@ def uniform(seed: int, episode: Tensor, stream: int, count: int) -> Tensor:
         count: numbers per episode.
 
     Raises:
-        PilotError: if the seed is negative.
+        PilotError: if the seed is negative or above MOST_SEED.
     """
-    if seed < 0:
-        raise PilotError(f"the seed is {seed}, but it must not be negative")
+    require_seed(seed)
     with np.errstate(over="ignore"):
         key = _mix(np.array([seed], dtype=np.uint64) + _GOLDEN)
         key = _mix(key + np.uint64(stream) * _GOLDEN)

@@ -97,6 +97,19 @@ def between(easy: RandomizationConfig, hard: RandomizationConfig, hardness: floa
     return RandomizationConfig(**mixed)
 
 
+def hand_forces(palm_position: Tensor, outward: Tensor, downward: Tensor) -> Tensor:
+    """Forces on left and right hand (N, 2, 3) [N], world frame.
+
+    ``palm_position`` (N, 2, 3) [m]; ``outward`` (N,) along the line between the palms and ``downward`` (N,) are
+    per hand [N].
+    """
+    across = palm_position[:, 0] - palm_position[:, 1]
+    to_the_left = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-3)
+    force = torch.stack([to_the_left, -to_the_left], dim=1) * outward[:, None, None]
+    force[..., 2] -= downward[:, None]
+    return force
+
+
 @dataclass
 class RandomizationState:
     """What was drawn for each robot's episode."""
@@ -240,11 +253,7 @@ class Randomizer:
         pushed = torch.zeros(len(heading), dtype=torch.bool, device=heading.device)
         # Those of an episode that began under other conditions too.
         if config.hand_load_probability > 0.0 or bool((state.hand_load != 0.0).any()):
-            across = robot.palm_position[:, 1] - robot.palm_position[:, 0]
-            inwards = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-3)
-            squeeze = state.hand_load[:, 1:2] * inwards
-            force = torch.stack([squeeze, -squeeze], dim=1)
-            force[..., 2] -= state.hand_load[:, :1]
+            force = hand_forces(robot.palm_position, outward=-state.hand_load[:, 1], downward=state.hand_load[:, 0])
             self.simulation.set_hand_force(force)
         if config.push_velocity > 0.0:
             state.push_countdown -= self.simulation.control_period

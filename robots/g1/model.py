@@ -61,11 +61,15 @@ class ModelOptions:
     visuals: bool = False
     """Load the visual meshes (for pictures and recordings; never needed for physics)."""
     elliptic_friction: bool = False
-    """Elliptic friction cones with impratio 10 (grasping) instead of pyramidal ones (locomotion, cheaper)."""
+    """Elliptic friction cones with ``impratio`` (grasping) instead of pyramidal ones (locomotion, cheaper)."""
     floor: bool = True
     """Add an infinite ground plane named ``floor``."""
     solver_iterations: int = 10
     """Most Newton iterations per step; it stops once converged. With 3, feet of friction 0.5 never come to rest."""
+    line_search_iterations: int = 20
+    """Most iterations of the line search in each of them. A higher ``impratio`` needs more."""
+    impratio: float = 10.0
+    """How much stiffer friction is than contact, with elliptic cones: what keeps a squeezed box from creeping."""
     friction: float = 1.0
     """Sliding friction coefficient of floor, feet and palms."""
     armature_scale: float = 1.0
@@ -182,12 +186,12 @@ def _set_physics(spec: mujoco.MjSpec, options: ModelOptions) -> None:
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.iterations = options.solver_iterations
-    spec.option.ls_iterations = 20
+    spec.option.ls_iterations = options.line_search_iterations
     # Whoever steps the robot ends the episode of one that diverged; MuJoCo would put it back upright, unseen.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if options.elliptic_friction:
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        spec.option.impratio = 10.0
+        spec.option.impratio = options.impratio
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
 
 

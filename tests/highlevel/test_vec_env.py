@@ -75,6 +75,22 @@ def test_double_precision_around_it_changes_nothing(untrained_controller: Path, 
         torch.set_default_dtype(torch.float32)
 
 
+def test_what_it_cannot_use_is_refused_in_one_sentence(
+    untrained_controller: Path, coarse_physics: PhysicsConfig
+) -> None:
+    environment = PlannerEnv("lift_box", untrained_controller, coarse_physics)
+    for seed in (-1, 2**63, 2**70):
+        with pytest.raises(ValueError, match=r"it must be between 0 and 2\^63 - 1"):
+            environment.reset(seed=seed)
+    with pytest.raises(ValueError, match="no option 'mass' to reset with"):
+        environment.reset(seed=0, options={"mass": 3.0})
+    environment.reset(seed=2**63 - 1)
+    with pytest.raises(ValueError, match=r"the action has the shape \(1, 21\), but it must be \(21,\)"):
+        environment.step(np.zeros((1, 21), np.float32))
+    with pytest.raises(ValueError, match="must be finite"):
+        environment.step(np.full(21, np.nan, np.float32))
+
+
 def test_stepping_a_finished_gymnasium_episode_is_refused(
     untrained_controller: Path, coarse_physics: PhysicsConfig
 ) -> None:

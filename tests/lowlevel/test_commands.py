@@ -79,8 +79,11 @@ def test_arms_that_hold_are_mirror_images_of_each_other_and_others_are_not(space
     for name, kind in KINDS.items():
         if kind.arms:
             arms = draw(space, ((name, 1.0),))[0][:, ARMS].numpy()
-            assert np.array_equal(ARMS_MIRROR(arms), arms) is kind.arms_alike, name
-            assert ARMS_MIRROR(arms)[:, 0].std() > 0.3
+            assert np.allclose(ARMS_MIRROR(arms), arms) is (kind.left_arm is not None), name
+            assert arms[:, 0].std() > 0.3
+            if kind.left_arm is not None:
+                low, high = np.array(kind.left_arm).T
+                assert (arms[:, :7] >= low - 1e-6).all() and (arms[:, :7] <= high + 1e-6).all()
 
 
 def test_unknown_kinds_and_wrong_shares_are_refused() -> None:

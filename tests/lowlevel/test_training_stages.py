@@ -54,7 +54,8 @@ def test_only_kinds_that_a_stage_brings_in_open_anew(tmp_path: Path) -> None:
     trainer = Trainer(tiny(first, replace(SECOND, mixture=(("walk", 0.5), ("slow", 0.5)))), tmp_path)
     trainer.curriculum.opening[:] = 0.9
     trainer.observation = trainer.environment.reset()
-    trainer._follow_stages({"reward/alive": 100.0}, print)
+    assert trainer._stage_is_over({"reward/alive": 100.0})
+    trainer._enter_next_stage(print)
     opening = dict(zip(KINDS, trainer.environment.opening.tolist(), strict=True))
     assert opening["walk"] == opening["squat"] == pytest.approx(0.9) and opening["slow"] == pytest.approx(0.3)
 

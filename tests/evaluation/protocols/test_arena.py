@@ -17,14 +17,13 @@ from evaluation.protocols.arena import (
     batch_steps,
     constant,
     episode_seeds,
-    hand_forces,
 )
 from evaluation.protocols.trace import Channel, record
 from lowlevel.commands import ARMS, HEIGHT, VELOCITY, command_space
 from lowlevel.control.controller import Controller
 from lowlevel.control.observation import NoiseConfig
 from lowlevel.control.whole_body import Bounds, Supports
-from lowlevel.world.randomization import RandomizationConfig
+from lowlevel.world.randomization import RandomizationConfig, hand_forces
 from lowlevel.world.terrain import TerrainConfig
 from robots.g1.constants import FOOT_BODIES, HAND_BODIES, NUM_JOINTS, gain_set
 from robots.g1.model import build_spec, joint_limits

@@ -148,7 +148,8 @@ def begun(tmp_path: Path, first: Stage, calibration: CalibrationConfig) -> tuple
     trainer = Trainer(replace(small(first, calibrated, robots=32), calibration=calibration), tmp_path)
     trainer.observation = trainer.environment.reset()
     lines: list[str] = []
-    trainer._follow_stages({"reward/alive": 10.0}, lines.append)
+    assert trainer._stage_is_over({"reward/alive": 10.0})
+    trainer._enter_next_stage(lines.append)
     assert trainer.stage.name == "calibrated" and trainer.observation
     return trainer, lines
 
