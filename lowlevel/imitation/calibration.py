@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +21,7 @@ from lowlevel.commands import ARMS, COMMAND_SIZE, MIRROR, VELOCITY, CommandSpace
 from lowlevel.control.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, columns
 from lowlevel.environment import PilotEnvironment
 from lowlevel.imitation.cloning import CloningConfig, clone
+from lowlevel.imitation.upright import UprightConfig, UprightTeacher
 from lowlevel.learning.ppo import PPO
 from lowlevel.runs.distributed import any_rank, broadcast
 from lowlevel.world.measures import velocity_error
@@ -46,6 +47,7 @@ class CalibrationConfig:
     """Time from when the slewed velocity has reached the command until the integrator has settled [s]."""
     epochs: int = 60
     """Passes of the fit over the commands that were measured."""
+    upright: UprightConfig = field(default_factory=UprightConfig)
 
 
 class Correction(nn.Module):
@@ -162,7 +164,7 @@ def calibrate(
     cloning: CloningConfig,
     report: Callable[[str], None],
 ) -> dict[str, Tensor]:
-    """Make the policy of ``ppo`` walk at the velocities that it is told in ``environment``.
+    """Make the policy of ``ppo`` walk at the velocities that it is told in ``environment``, and hold its torso upright.
 
     ``report`` is told how it goes. Returns the observation to go on from. All ranks take rank 0's fit.
     """
@@ -177,4 +179,4 @@ def calibrate(
     broadcast([*correction.parameters(), correction.known])
     shares = ", ".join(f"{share:.2f}" for share in explained)
     report(f"calibrated by {len(commands)} commands; shares of vx, vy, yaw rate explained: {shares}")
-    return clone(ppo, environment, teacher, cloning, report)
+    return clone(ppo, environment, UprightTeacher(teacher, environment, config.upright), cloning, report)
