@@ -53,7 +53,6 @@ def _run(arguments: list[str]) -> None:
         description="Train a PILOT controller. Defaults below are those of the chosen preset or earlier run.",
     )
     device = distributed.start(parsed.config.device)
-    torch.set_float32_matmul_precision("medium")
     # Physics and learning take turns on the same cores.
     torch.set_num_threads(max(1, parsed.config.environment.num_threads))
     try:

@@ -31,6 +31,7 @@ from lowlevel.networks.sight import give_sight
 from lowlevel.runs.distributed import any_rank, average_over_ranks, rank, world_size
 from lowlevel.runs.draws import require_seed
 from lowlevel.runs.interrupts import stop_on_signals
+from lowlevel.runs.precision import coarse_products
 from lowlevel.runs.progress import ProgressReport
 from lowlevel.runs.run_folder import RunFolder
 from lowlevel.stages import Stage
@@ -227,7 +228,8 @@ class Trainer:
         terms, tracking = Averages(), Averages()
         started = time.monotonic()
         for _ in range(self.ppo.storage.steps):
-            action = self.ppo.act(self.observation)
+            with coarse_products():
+                action = self.ppo.act(self.observation)
             result = self.environment.step(action.cpu())
             # New commands and pushes change what the future is worth, and no action is to blame for it.
             interrupted = result.truncated | result.surprised
@@ -237,7 +239,8 @@ class Trainer:
             terms.add(result.terms | {"total": result.reward / self.environment.control_period})
             tracking.add(_tracking(result))
         collection_seconds = time.monotonic() - started
-        losses = self.ppo.update(self.observation)
+        with coarse_products():  # as when it acted, or the first ratios of probabilities would not be 1
+            losses = self.ppo.update(self.observation)
         self.steps += self._steps_per_iteration
 
         mean_terms = terms.take()

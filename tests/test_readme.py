@@ -20,14 +20,17 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def test_the_example_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_examples_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    (example,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    names: dict[str, object] = {}
-    exec(compile(example, "README.md", "exec"), names)
-    targets = names["targets"]
+    examples = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    names: list[dict[str, object]] = [{} for _ in examples]
+    for example, defined in zip(examples, names, strict=True):
+        exec(compile(example, "README.md", "exec"), defined)
+    controller, task = names
+    targets = controller["targets"]
     assert isinstance(targets, torch.Tensor)
     assert targets.shape == (1, 29) and targets.isfinite().all()
+    assert isinstance(task["reward"], float)
 
 
 def test_every_option_that_is_shown_exists(capsys: pytest.CaptureFixture[str]) -> None:

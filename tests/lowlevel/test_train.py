@@ -88,6 +88,27 @@ def test_a_run_that_sees_begins_with_what_a_blind_one_does(tmp_path: Path) -> No
         blind.begin_seeing(blind.run)
 
 
+def test_only_networks_multiply_coarsely(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, str] = {}
+    trainer = Trainer(tiny(), tmp_path)
+
+    def watch(name: str, owner: object, method: str) -> None:
+        original = getattr(owner, method)
+
+        def watched(*arguments: object, **options: object) -> object:
+            seen[name] = torch.get_float32_matmul_precision()
+            return original(*arguments, **options)
+
+        monkeypatch.setattr(owner, method, watched)
+
+    watch("act", trainer.ppo, "act")
+    watch("update", trainer.ppo, "update")
+    watch("world", trainer.environment, "step")
+    run(trainer, 1)
+    assert seen == {"act": "medium", "update": "medium", "world": "highest"}
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
 def test_networks_that_see_do_not_begin_from_nothing(tmp_path: Path) -> None:
     for preset in ("vision", "no-attention"):
         with pytest.raises(SystemExit, match="name its folder with --blind"):
@@ -236,7 +257,7 @@ def test_a_state_that_cannot_be_used_is_refused_and_left_alone(tmp_path: Path) -
     assert f"weight {bias!r}" in refusal() and "is not finite" in refusal()
 
 
-@pytest.mark.parametrize(("name", "stage"), [("pilot-g1-simple", "carry"), ("pilot-g1-from-nothing", "carry")])
+@pytest.mark.parametrize(("name", "stage"), [("pilot-g1-simple", "carry"), ("pilot-g1-from-nothing", "settle")])
 def test_a_shipped_learning_state_can_be_continued(name: str, stage: str) -> None:
     run = Path(__file__).resolve().parents[2] / "checkpoints" / "training" / name
     config = RunFolder(run).config(TrainingConfig)
