@@ -2,7 +2,7 @@
 
 The paper opens its ranges one after the other. Here each kind of command (:data:`lowlevel.commands.KINDS`) has an
 opening of its own, and kinds that are tracked badly are drawn more often, down to a floor for all others. So are kinds
-of tile (:data:`lowlevel.world.terrain.TILES`), whose levels robots climb by themselves (:mod:`lowlevel.levels`).
+of tile (:data:`lowlevel.world.terrain.TILES`), whose levels robots climb by themselves (:mod:`lowlevel.world.levels`).
 """
 
 from __future__ import annotations

@@ -28,9 +28,9 @@ from lowlevel.control.observation import (
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.control.stepping import swing_first
 from lowlevel.gait_prior import GaitPrior
-from lowlevel.levels import Levels
 from lowlevel.rewards import Transition, compute_rewards, tracking_quality
 from lowlevel.task import TaskConfig
+from lowlevel.world.levels import Levels
 from lowlevel.world.measures import Measurement, is_lost, velocity_error, with_rows
 from lowlevel.world.privileged import PRIVILEGED, PrivilegedView
 from lowlevel.world.randomization import Randomizer

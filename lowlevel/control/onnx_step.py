@@ -39,7 +39,7 @@ CONVENTIONS = "conventions"
 """Metadata entry of the file: JSON, the "config" of ``controller.json``, such as joint names, default pose, gains,
 control period and command space."""
 IR_VERSION = 10
-"""Of the file: what ONNX Runtime has read since version 1.19 of August 2024."""
+"""Of the file: that of ONNX 1.16 and 1.17, so that runtimes of 2024 read it."""
 
 
 class _Flat(nn.Module):

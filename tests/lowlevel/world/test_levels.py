@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment
-from lowlevel.levels import CROSSED, LARGEST_ERROR, Levels
 from lowlevel.task import TaskConfig
+from lowlevel.world.levels import CROSSED, LARGEST_ERROR, Levels
 from lowlevel.world.terrain import TILES, Terrain, TerrainConfig
 
 NAMES = list(TILES)
@@ -92,7 +92,7 @@ def test_a_mastered_level_leads_to_the_next_tile(monkeypatch: pytest.MonkeyPatch
     config = EnvironmentConfig(num_robots=4, num_threads=1, episode_length=0.1)
     environment = PilotEnvironment(config, TaskConfig(terrain=terrain))
     environment.reset()
-    monkeypatch.setattr("lowlevel.levels.CROSSED", 0.0)
+    monkeypatch.setattr("lowlevel.world.levels.CROSSED", 0.0)
     for _ in range(5):
         result = environment.step(torch.zeros(4, 29))
     assert result.truncated.all() and (environment.buffers.tile == 1).all()
