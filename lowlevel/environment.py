@@ -164,8 +164,12 @@ class PilotEnvironment:
         measured = self.world.measure()
         return self._observe(measured, self._seen_ground(measured), self._everyone)
 
-    def step(self, action: Tensor) -> StepResult:
-        """Apply residual ``action`` (N, 29), in action scales, for one control step of 0.02 s."""
+    def step(self, action: Tensor, believed_capture_point: Tensor | None = None) -> StepResult:
+        """Apply residual ``action`` (N, 29), in action scales, for one control step of 0.02 s.
+
+        ``believed_capture_point`` (N, 2) [m], heading frame, decides whether robots that rest step, as in the frozen
+        controller: the policy's own estimate, or by default the true one.
+        """
         buffers = self.buffers
         action = action.clamp(-self.config.action_limit, self.config.action_limit)
         if not self.task.arms_act:
@@ -202,8 +206,8 @@ class PilotEnvironment:
         reward, terms = compute_rewards(transition, self.task.rewards, self.control_period)
         quality = tracking_quality(transition)
         command, kind, tile_kind = buffers.command, buffers.kind.clone(), buffers.tile_kind.clone()
-        # The frozen controller goes by the policy's estimate of the capture point.
-        buffers.reference = self.reference.begin_step(buffers.reference, swing_first(measured.capture_point))
+        believed = measured.capture_point if believed_capture_point is None else believed_capture_point
+        buffers.reference = self.reference.begin_step(buffers.reference, swing_first(believed))
         next_privileged = build(PRIVILEGED, self._view(measured, ground))
 
         done, now = torch.nonzero(fallen | truncated)[:, 0], measured

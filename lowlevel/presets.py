@@ -92,6 +92,15 @@ HOLDING = (
 )
 """Mostly for loads before the chest: under them a robot that has learned everything at once leans forwards."""
 
+CATCHING = (
+    ("stand", 0.25),
+    ("steer", 0.2),
+    ("stand_and_work", 0.2),
+    ("stand_and_hold", 0.1),
+    ("walk_and_work", 0.25),
+)
+"""Mostly for pushes, which fell a robot that stands before any other."""
+
 UNEVEN = TerrainConfig(tiles=("flat", "rough"), levels=(1.0 / 3.0,), tile_size=8.0)
 """Like the simple terrain of the paper: flat, and steps of up to 4 cm, made of a tenth of the blocks that
 the slabs of the evaluation take."""
@@ -220,6 +229,15 @@ STAGES = (
         mixture=HOLDING,
         rewards=EXACT,
         randomization=replace(GENTLE, hand_load_probability=0.8),
+    ),
+    Stage(
+        name="catch",
+        most_steps=10_000_000,
+        std=(0.12, 0.15),
+        noise_at_rest=0.6,
+        mixture=CATCHING,
+        rewards=EXACT,
+        randomization=replace(GENTLE, hand_load_probability=0.4, push_velocity=0.8, push_interval=(2.0, 5.0)),
     ),
     Stage(
         name="settle",

@@ -229,8 +229,8 @@ class Trainer:
         started = time.monotonic()
         for _ in range(self.ppo.storage.steps):
             with coarse_products():
-                action = self.ppo.act(self.observation)
-            result = self.environment.step(action.cpu())
+                action, capture_point = self.ppo.act(self.observation)
+            result = self.environment.step(action.cpu(), capture_point.cpu())
             # New commands and pushes change what the future is worth, and no action is to blame for it.
             interrupted = result.truncated | result.surprised
             self.ppo.record(result.reward, result.terminated, interrupted, result.next_privileged, result.kind)

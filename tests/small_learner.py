@@ -71,7 +71,7 @@ def run_update(ppo: PPO, seed: int) -> dict[str, float]:
     robots = ppo.storage.num_envs
     observed = observation(generator, robots)
     for _ in range(ppo.storage.steps):
-        action = ppo.act(observed)
+        action, _ = ppo.act(observed)
         reward = -(action - best_action(observed)).square().sum(dim=1)
         ended = torch.rand(robots, generator=generator) < 0.1
         observed = observation(generator, robots)

@@ -21,6 +21,7 @@ from lowlevel.control.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, colu
 from lowlevel.environment import PilotEnvironment
 from lowlevel.gait_prior import GaitPrior
 from lowlevel.learning.ppo import PPO
+from lowlevel.networks.actor import CAPTURE_POINT
 from lowlevel.runs.distributed import average_over_ranks
 from robots.g1.constants import NUM_JOINTS
 
@@ -117,7 +118,7 @@ def clone(
             action = torch.where(teachers_turn, label, own.mean) + noise
             samples.append((frame, *(c.clone() for c in context), own.motion, own.latent, label))
             samples.append(_mirrored(ppo, seen, label))
-            result = environment.step(action.cpu())
+            result = environment.step(action.cpu(), own.motion[:, CAPTURE_POINT].cpu())
             falls += int(result.terminated.sum())
             teacher.forget((result.terminated | result.truncated).to(device))
             observation = result.observation

@@ -19,7 +19,7 @@ from lowlevel.learning.estimation import ESTIMATED
 from lowlevel.learning.learner import ACTOR_KEYS, POLICY_KEYS, Learner, PPOConfig
 from lowlevel.learning.rollout import RolloutStorage, generalized_advantages, normalized_by_task
 from lowlevel.learning.symmetry import TensorMirrors
-from lowlevel.networks.actor import MOTION_SIZE, NetworkConfig, ObservationSizes
+from lowlevel.networks.actor import CAPTURE_POINT, MOTION_SIZE, NetworkConfig, ObservationSizes
 from lowlevel.runs.checks import NonFiniteError, require_finite
 from lowlevel.runs.distributed import rank
 from robots.errors import PilotError
@@ -116,8 +116,11 @@ class PPO:
         return self.learner.learning_rate
 
     @torch.no_grad()
-    def act(self, observation: Mapping[str, Tensor]) -> Tensor:
+    def act(self, observation: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Sample actions (N, A) for the observations of N robots and store both.
+
+        Returns:
+            the actions, and the estimated capture point (N, 2) [m], heading frame.
 
         Raises:
             NonFiniteError: if an action is not finite; the message names the observation that caused it, if
@@ -138,7 +141,7 @@ class PPO:
             "log_prob": self.learner.log_prob(output.mean, action, frame),
         }
         self.storage.write({**observation, **estimates, **acted})
-        return action
+        return action, output.motion[:, CAPTURE_POINT]
 
     def _noise(self, frame: Tensor) -> Tensor:
         """Exploration noise of unit variance (N, A), a share of which is a pattern over the gait clock.

@@ -52,8 +52,8 @@ class RandomizationConfig:
     """Force on each hand towards the other one [N]; negative pushes outwards, as a squeezed box does."""
     start_velocity: float = 0.1
     """Largest velocity of the base at the start of an episode, per axis [m/s]."""
-    push_velocity: float = 0.5
-    """Largest horizontal velocity change of a push, per axis [m/s], as in mjlab."""
+    push_velocity: float = 0.7
+    """Largest horizontal velocity change of a push, per axis [m/s]; 0.5 in mjlab."""
     push_interval: tuple[float, float] = (4.0, 8.0)
     """Time between pushes [s]."""
     map_offset: float = 0.05

@@ -130,9 +130,9 @@ def test_the_priors_legs_take_turns_and_its_ankles_answer_at_a_stand(reference: 
     command = space.neutral().repeat(2, 1)
     command[:, VELOCITY] = torch.tensor([0.6, 0.0, 0.0])
     assert (prior(ReferenceState.standing(command), centered, as_told + 0.1) == 0.0).all()
-    topples = prior(ReferenceState.standing(command), torch.tensor([[0.1, 0.0], [0.0, 0.1]]), as_told)
+    topples = prior(ReferenceState.standing(command), torch.tensor([[0.08, 0.0], [0.0, 0.08]]), as_told)
     ankles = [joint_index(f"{side}_ankle_pitch_joint") for side in ("left", "right")]
-    assert topples[0, ankles].tolist() == pytest.approx([0.1 * GaitPriorConfig().balance] * 2)
+    assert topples[0, ankles].tolist() == pytest.approx([0.08 * GaitPriorConfig().balance] * 2)
     assert topples[0].count_nonzero() == 6 and topples[1].count_nonzero() == 0
     halves = prior(ReferenceState(command, torch.tensor([1.0, 1.0 + math.pi])), centered + 0.1, as_told)
     np.testing.assert_allclose(halves[1].numpy(), JOINTS_MIRROR(halves[0].numpy()), atol=1e-6)

@@ -203,7 +203,7 @@ def test_exploration_noise_has_the_stated_deviation_and_is_clamped() -> None:
     ppo = make_ppo(2048, initial_std=0.3, steps_per_update=1, minibatches=1)
     ppo.enter((0.3, 0.4), acting=4)
     observed = observation(torch.Generator().manual_seed(0), 2048)
-    noise = ppo.act(observed) - ppo.deterministic(observed)
+    noise = ppo.act(observed)[0] - ppo.deterministic(observed)
     torch.testing.assert_close(noise.std(dim=0), torch.full((4,), 0.3), rtol=0.06, atol=0)
     with torch.no_grad():
         ppo.actor.log_std.fill_(5.0)
@@ -245,7 +245,7 @@ def test_a_robot_at_rest_has_a_share_of_the_noise_and_its_probability_knows() ->
     clock[:] = torch.stack([angle.sin(), angle.cos()], dim=1)
     rests = torch.arange(robots) % 2 == 0
     clock[rests] = 0.0
-    noise = ppo.act(observed) - ppo.deterministic(observed)
+    noise = ppo.act(observed)[0] - ppo.deterministic(observed)
     for which, std in ((rests, 0.1), (~rests, 0.4)):
         torch.testing.assert_close(noise[which].std(dim=0), torch.full((4,), std), rtol=0.06, atol=0.0)
         by_hand = (-0.5 * (noise[which] / std) ** 2 - math.log(std) - 0.5 * math.log(2.0 * math.pi)).sum(dim=1)
