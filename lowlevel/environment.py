@@ -217,7 +217,7 @@ class PilotEnvironment:
             fresh = self.world.measure(done)
             now = with_rows(measured, done, fresh)
             ground = ground.index_copy(0, done, self._seen_ground(fresh))
-        buffers.hand_force, pushed = self.randomizer.disturb(now.robot, now.heading)
+        buffers.hand_force, pushed = self.randomizer.disturb(now.robot, now.heading, buffers.reference.walking)
         surprised = self._resample_due_commands() | pushed
         self._advance_reference()
         self._step_count += 1

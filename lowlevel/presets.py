@@ -58,6 +58,7 @@ GENTLE = RandomizationConfig(
     hand_load_probability=0.0,
     start_velocity=0.1,
     push_velocity=0.15,
+    standing_push_velocity=0.15,
     delay=(0.7, 0.3, 0.0),
     waist_effort=(50.0, 50.0),
     map_offset=0.0,
@@ -232,12 +233,12 @@ STAGES = (
     ),
     Stage(
         name="catch",
-        most_steps=10_000_000,
+        most_steps=6_000_000,
         std=(0.12, 0.15),
         noise_at_rest=0.6,
         mixture=CATCHING,
         rewards=EXACT,
-        randomization=replace(GENTLE, hand_load_probability=0.4, push_velocity=0.8, push_interval=(2.0, 5.0)),
+        randomization=replace(GENTLE, hand_load_probability=0.4, standing_push_velocity=0.8, push_interval=(2.0, 5.0)),
     ),
     Stage(
         name="settle",

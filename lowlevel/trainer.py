@@ -175,6 +175,8 @@ class Trainer:
         self.save()
         prior, upcoming = self.environment.prior, self.config.stages[self.stage_number + 1]
         self.curriculum.introduce((shares(upcoming.mixture) > 0.0) & (self._shares == 0.0))
+        if upcoming.harder is not None:
+            self.curriculum.hardness = torch.zeros(())  # what is calibrated in hard conditions is their noise
         self._begin_stage(self.stage_number + 1)
         if prior is not None and upcoming.prior is None:
             report("absorbing the gait prior")

@@ -43,6 +43,7 @@ _NOT_DRAWN = (
     "hand_load_probability",
     "start_velocity",
     "push_velocity",
+    "standing_push_velocity",
     "map_offset",
     "map_drift",
     "map_delay",

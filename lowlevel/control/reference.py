@@ -29,6 +29,9 @@ from robots.g1.arm_mass import ArmMass
 from robots.g1.constants import ARM_JOINTS, GRAVITY, LOWER_JOINTS, Gains
 from robots.g1.nominal_pose import NominalPose
 
+CATCHING = 8.0 * math.pi
+"""Phase from which on a robot catches itself [rad]."""
+
 
 @dataclass(frozen=True)
 class ReferenceConfig:
@@ -36,6 +39,9 @@ class ReferenceConfig:
 
     gait_frequency: float = 2.0
     """Steps of one foot per second [Hz]."""
+    catching_frequency: float = 3.0
+    """The same of a robot that steps because it topples [Hz]. One pushed to its side brings the free foot in first, and
+    has toppled 1.6 times as far by the time that the other one has swung outwards at 2 Hz."""
     velocity_rate: float = 2.5
     """Slew rate of the velocity away from zero [m/s^2] and [rad/s^2]."""
     braking_rate: float = 1.5
@@ -55,7 +61,7 @@ class ReferenceState(NamedTuple):
     """Slewed command (N, 21)."""
     phase: Tensor
     """Gait phase (N,) [rad]: the left foot swings in (0, pi), the right one in (pi, 2 pi); 0 while standing. The same
-    goes on beyond 2 pi while the robot stops."""
+    goes on beyond 2 pi while the robot stops, and from CATCHING on while it catches itself."""
 
     @classmethod
     def standing(cls, command: Tensor) -> ReferenceState:
@@ -97,6 +103,7 @@ class Reference:
         self._largest_change, self._largest_braking = rate * control_period, braking * control_period
         self._lowest, self._highest = torch.tensor(WALKING_POSTURE, device=device).unbind(-1)
         self._phase_step = 2.0 * math.pi * config.gait_frequency * control_period
+        self._catching_step = 2.0 * math.pi * config.catching_frequency * control_period
 
     def clamp(self, command: Tensor) -> Tensor:
         """See :func:`lowlevel.commands.clamp_posture`."""
@@ -124,7 +131,7 @@ class Reference:
         ``swing_first`` (N,): the foot to begin with, 1 left, -1 right, 0 for no step.
         """
         steps = (swing_first != 0.0) & ~state.walking
-        beginning = torch.where(swing_first > 0.0, 0.0, math.pi) + self._phase_step
+        beginning = CATCHING + torch.where(swing_first > 0.0, 0.0, 5.0 * math.pi) + self._catching_step
         return state._replace(phase=torch.where(steps, beginning, state.phase))
 
     def _can_walk(self, command: Tensor) -> Tensor:
@@ -140,11 +147,18 @@ class Reference:
         return torch.cat([command[:, VELOCITY] * self._can_walk(state.command), within, command[:, ARMS]], dim=1)
 
     def _stopping(self, phase: Tensor) -> Tensor:
-        """The next phase (N,) of robots that stop: from (0, pi) on to 4 pi, from (pi, 2 pi) on to 7 pi, then 0."""
+        """The next phase (N,) of robots that stop: from (0, pi) on to 4 pi, from (pi, 2 pi) on to 7 pi, then 0.
+
+        Of those that catch themselves: from CATCHING, or from 5 pi beyond it, on for 2 pi.
+        """
         turns = torch.where(phase < math.pi, 1.0, 2.0) * (phase < 2.0 * math.pi)
         stopping = phase + 2.0 * math.pi * turns + self._phase_step
         end = torch.where(stopping < 4.5 * math.pi, 4.0 * math.pi, 7.0 * math.pi)
-        return torch.where((phase > 0.0) & (stopping < end), stopping, 0.0)
+        catching = phase + self._catching_step
+        caught = CATCHING + torch.where(catching < CATCHING + 3.5 * math.pi, 2.0, 7.0) * math.pi
+        catches = phase >= CATCHING
+        following, end = torch.where(catches, catching, stopping), torch.where(catches, caught, end)
+        return torch.where((phase > 0.0) & (following < end), following, 0.0)
 
     def joint_targets(self, state: ReferenceState) -> Tensor:
         """PD targets (N, 29) [rad] that hold the slewed posture, led by what gravity would make the joints sag.

@@ -52,8 +52,10 @@ class RandomizationConfig:
     """Force on each hand towards the other one [N]; negative pushes outwards, as a squeezed box does."""
     start_velocity: float = 0.1
     """Largest velocity of the base at the start of an episode, per axis [m/s]."""
-    push_velocity: float = 0.7
-    """Largest horizontal velocity change of a push, per axis [m/s]; 0.5 in mjlab."""
+    push_velocity: float = 0.4
+    """Largest horizontal velocity change of a push, per axis, of robots whose gait clock runs [m/s]; 0.5 in mjlab."""
+    standing_push_velocity: float = 0.8
+    """The same of those that stand [m/s]. Pushes of 0.8 m/s while they walk cost 0.04 m/s of E_v within 6M steps."""
     push_interval: tuple[float, float] = (4.0, 8.0)
     """Time between pushes [s]."""
     map_offset: float = 0.05
@@ -63,6 +65,11 @@ class RandomizationConfig:
     map_delay: tuple[float, float, float] = (0.4, 0.4, 0.2)
     """Chances that a robot's maps are 0, 100 and 200 ms old when they arrive: those of a LiDAR are 120 to 280 ms old in
     InternRobotics/Gallant."""
+
+    @property
+    def pushes(self) -> bool:
+        """Whether robots are pushed."""
+        return max(self.push_velocity, self.standing_push_velocity) > 0.0
 
     @classmethod
     def for_evaluation(cls) -> RandomizationConfig:
@@ -78,6 +85,7 @@ class RandomizationConfig:
             hand_load_probability=0.0,
             start_velocity=0.0,
             push_velocity=0.0,
+            standing_push_velocity=0.0,
             map_offset=0.0,
             map_drift=0.0,
             map_delay=(1.0, 0.0, 0.0),
@@ -204,7 +212,7 @@ class Randomizer:
         carries = (self._uniform(0.0, 1.0, count, 1) < config.hand_load_probability).float()
         load = [self._uniform(*config.hand_payload, count), self._uniform(*config.hand_squeeze, count)]
         state.hand_load[ids] = torch.stack(load, -1) * carries
-        if config.push_velocity > 0.0:
+        if config.pushes:
             state.push_countdown[ids] = self._uniform(*config.push_interval, count)
 
         friction = self.simulation.per_robot("geom_friction")
@@ -242,8 +250,8 @@ class Randomizer:
         self.simulation.per_robot("body_ipos")[cells] = self._nominal_center + moved
         self.simulation.update_constants(ids)
 
-    def disturb(self, robot: RobotState, heading: Tensor) -> tuple[Tensor, Tensor]:
-        """Apply hand loads and due pushes for the next step.
+    def disturb(self, robot: RobotState, heading: Tensor, walking: Tensor) -> tuple[Tensor, Tensor]:
+        """Apply hand loads and due pushes for the next step; ``walking`` (N,): whether the gait clock runs.
 
         Returns:
             hand forces (N, 2, 3) [N], heading frame, and which robots were pushed (N,).
@@ -255,13 +263,14 @@ class Randomizer:
         if config.hand_load_probability > 0.0 or bool((state.hand_load != 0.0).any()):
             force = hand_forces(robot.palm_position, outward=-state.hand_load[:, 1], downward=state.hand_load[:, 0])
             self.simulation.set_hand_force(force)
-        if config.push_velocity > 0.0:
+        if config.pushes:
             state.push_countdown -= self.simulation.control_period
             due = state.push_countdown <= 0.0
             if due.any():
-                change = self._uniform(-config.push_velocity, config.push_velocity, len(due), 3)
+                largest = torch.where(walking, config.push_velocity, config.standing_push_velocity) * due
+                change = self._uniform(-1.0, 1.0, len(due), 3) * largest[:, None]
                 change[:, 2] = 0.0
-                self.simulation.push(change * due[:, None])
+                self.simulation.push(change)
                 pushed = due
                 state.push_countdown = torch.where(
                     due, self._uniform(*config.push_interval, len(due)), state.push_countdown

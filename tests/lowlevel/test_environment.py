@@ -236,7 +236,7 @@ def test_a_step_says_whether_another_command_follows() -> None:
 
 
 def test_a_step_says_whether_a_push_follows() -> None:
-    pushes = replace(CALM, push_velocity=0.5, push_interval=(0.04, 0.1))
+    pushes = replace(CALM, push_velocity=0.5, standing_push_velocity=0.5, push_interval=(0.04, 0.1))
     environment = quiet(num_robots=16, command_interval=(9.0, 9.1), randomization=pushes)
     environment.reset()
     surprised = torch.zeros(16, dtype=torch.bool)

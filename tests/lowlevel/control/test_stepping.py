@@ -1,5 +1,7 @@
 """When a robot that is told to stand must step, and how its gait clock then runs."""
 
+import math
+
 import pytest
 import torch
 
@@ -43,3 +45,23 @@ def test_a_robot_at_rest_makes_two_steps_and_rests_again() -> None:
     assert not state.walking.any()
     assert max(heights) == pytest.approx(0.55, abs=1e-3)
     torch.testing.assert_close(state.command, stand)
+
+
+def test_catching_steps_are_faster_and_lead_on_into_a_walk() -> None:
+    limits = joint_limits(build_spec().compile())
+    space = command_space(limits[:, 0].tolist(), limits[:, 1].tolist())
+    config = ReferenceConfig(gait_frequency=2.0, catching_frequency=2.5)
+    reference = Reference(config, GAINS["stiff"], control_period=0.02)
+    stand, walk = space.neutral().repeat(2, 1), space.neutral().repeat(2, 1)
+    walk[:, 0] = 0.5
+    caught = reference.begin_step(ReferenceState.standing(stand), torch.tensor([1.0, -1.0]))
+    state, steps = caught, 0
+    while state.walking.any():
+        assert state.walking.all(), "either foot's two steps take as long"
+        state, steps = reference.advance(state, stand), steps + 1
+    assert steps == pytest.approx(50 / 2.5, abs=1)
+    told_to_walk = reference.advance(caught, walk)
+    turned = torch.atan2(told_to_walk.clock[:, 0], told_to_walk.clock[:, 1]) - torch.atan2(
+        caught.clock[:, 0], caught.clock[:, 1]
+    )
+    torch.testing.assert_close(turned, torch.full((2,), 2.0 * math.pi * 2.0 * 0.02), atol=1e-4, rtol=0.0)
