@@ -25,6 +25,9 @@ class UprightConfig:
 
     rate: float = 1.0
     """[1/s]"""
+    leak: float = 0.3
+    """Rate at which it forgets [1/s]: what it adds comes to rest at 3.3 times an error that the student goes on making.
+    Without it the waists of a whole clone wind up to the limit, and their divergence drowns all else."""
     limit: float = 0.24
     """Largest correction [rad]."""
     settling: float = 0.5
@@ -55,7 +58,7 @@ class UprightTeacher:
         arrived &= apart[:, ARMS].amax(dim=1) < _ARRIVED_ARMS
         self._settled = torch.where(arrived, self._settled + period, 0.0)
         error = torso_error(environment.world.measure(), buffers.command)[:, 1]
-        change = config.rate * period * error * (self._settled > config.settling)
+        change = period * (config.rate * error + config.leak * self._added) * (self._settled > config.settling)
         self._added = (self._added - change).clamp(-config.limit, config.limit)
         action = self._inner.label(observation).clone()
         action[:, self._joint] += (self._added / environment.action_scale[self._joint]).to(action.device)

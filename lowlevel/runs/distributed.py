@@ -92,3 +92,16 @@ def broadcast(tensors: Iterable[Tensor]) -> None:
         return
     for tensor in tensors:
         dist.broadcast(tensor.detach(), src=0)
+
+
+def gathered(rows: Tensor) -> Tensor:
+    """The ``rows`` (n, ...) of all ranks, of which each may have another number, one rank's after the other's."""
+    if world_size() == 1:
+        return rows
+    counts = [torch.zeros((), dtype=torch.long) for _ in range(world_size())]
+    dist.all_gather(counts, torch.tensor(len(rows)))
+    most = int(max(counts))
+    padded = torch.cat([rows, rows.new_zeros(most - len(rows), *rows.shape[1:])])
+    parts = [torch.empty_like(padded) for _ in counts]
+    dist.all_gather(parts, padded)
+    return torch.cat([part[:count] for part, count in zip(parts, counts, strict=True)])

@@ -55,7 +55,7 @@ class RandomizationConfig:
     push_velocity: float = 0.4
     """Largest horizontal velocity change of a push, per axis, of robots whose gait clock runs [m/s]; 0.5 in mjlab."""
     standing_push_velocity: float = 0.8
-    """The same of those that stand [m/s]. Pushes of 0.8 m/s while they walk cost 0.04 m/s of E_v within 6M steps."""
+    """The same of those that stand [m/s]: what they must learn beside standing still."""
     push_interval: tuple[float, float] = (4.0, 8.0)
     """Time between pushes [s]."""
     map_offset: float = 0.05

@@ -70,50 +70,40 @@ def test_the_fit_finds_what_is_wanted(space: CommandSpace) -> None:
 
 
 class Follower:
-    """Robots that walk at a share of what their action says, along a slewed command; one of them falls at times.
-
-    For a second after a command, while the slewed one is on its way, they walk at twice the speed.
-    """
+    """Robots that walk at their own share of the command, once they have set off; the last one falls."""
 
     control_period = 0.02
-    lasting = 250
 
     def __init__(self, commands: Tensor, share: Tensor) -> None:
-        self.num_robots, self.share, self.steps = len(commands), share, 0
-        self.buffers = SimpleNamespace(command=commands, reference=SimpleNamespace(command=0.0 * commands))
+        self.share, self.steps = share, 0
+        self.buffers = SimpleNamespace(command=commands)
 
-    def reset(self, spread_episodes: bool) -> dict[str, Tensor]:
-        return {"command": self.buffers.command}
+    def reset(self) -> dict[str, Tensor]:
+        self.buffers.command, self.steps = -self.buffers.command, 0
+        return {}
 
-    def step(self, action: Tensor) -> SimpleNamespace:
-        arrived = self.steps % self.lasting > 50
-        walked = self.share[:, None] * action * (1.0 if arrived else 2.0)
-        measured = SimpleNamespace(linear_velocity=walked, yaw_rate=walked[:, 2])
+    def step(self, action: Tensor, capture_point: Tensor) -> SimpleNamespace:
         self.steps += 1
-        falls = torch.zeros(self.num_robots, dtype=torch.bool)
-        falls[-1] = self.steps % 100 == 0
-        if self.steps % self.lasting == 0:
-            self.buffers.command = -self.buffers.command
-        self.buffers.reference = SimpleNamespace(command=self.buffers.command * arrived)
-        observation = {"command": self.buffers.command}
-        return SimpleNamespace(observation=observation, measured=measured, terminated=falls, truncated=falls & False)
+        sways = 0.2 * (-1.0) ** self.steps
+        has_set_off = self.steps > 150
+        walked = self.share[:, None] * self.buffers.command[:, VELOCITY] * has_set_off + sways
+        measured = SimpleNamespace(linear_velocity=walked, yaw_rate=walked[:, 2])
+        falls = torch.zeros(len(walked), dtype=torch.bool)
+        falls[-1] = self.steps == 20
+        return SimpleNamespace(observation={}, measured=measured, terminated=falls)
 
 
-def test_the_integrator_finds_what_a_robot_must_be_told(space: CommandSpace) -> None:
+def test_the_lasting_error_of_each_command_is_measured(space: CommandSpace) -> None:
     command = some_commands(space, 20)
-    command[:, VELOCITY] = 0.3 * torch.sign(command[:, VELOCITY])
     command[0, VELOCITY] = 0.0
-    share = torch.full((20,), 0.8)
-    share[1] = 0.2  # would have to be told 1.5
-    teacher = SimpleNamespace(label=lambda observation, further: observation["command"][:, VELOCITY] + further)
+    share = torch.linspace(0.7, 1.2, 20)
+    output = SimpleNamespace(mean=torch.zeros(20, 29), motion=torch.zeros(20, 5))
+    ppo = SimpleNamespace(device=torch.device("cpu"), learner=SimpleNamespace(policy=lambda seen: output))
     follower = Follower(command, share)
-    config = CalibrationConfig(steps=2 * Follower.lasting + 1, limit=0.5)
-    told, added = measure(teacher, follower, torch.device("cpu"), config)  # type: ignore[arg-type]
-    # Neither the robot that stands nor the one that falls before its integrator has settled; the others, each twice.
-    assert torch.equal(told, torch.cat([command[1:-1], -command[1:-1]]))
-    wanted = 0.25 * told[:, VELOCITY]
-    wanted[::18] = 0.5 * torch.sign(told[::18, VELOCITY])
-    assert torch.allclose(added, wanted, atol=0.02)
+    told, errors = measure(ppo, follower, CalibrationConfig(duration=4.5, averaged=1.48), rounds=2)  # type: ignore[arg-type]
+    # Neither the robot that stands nor the one that falls; the others, each twice.
+    assert torch.equal(told, torch.cat([-command[1:-1], command[1:-1]]))
+    assert torch.allclose(errors, (share[1:-1, None].repeat(2, 1) - 1.0) * told[:, VELOCITY], atol=1e-5)
 
 
 def test_the_teacher_sees_the_corrected_velocity_in_every_frame(tmp_path: Path) -> None:
@@ -124,7 +114,6 @@ def test_the_teacher_sees_the_corrected_velocity_in_every_frame(tmp_path: Path) 
     moved = torch.tensor([0.1, 0.0, 0.0])
     with torch.no_grad():
         list(correction.parameters())[-1][:] = moved
-    further = torch.tensor([[0.05, -0.1, 0.2]]).expand(8, 3)
     lower, upper = (bound[VELOCITY] for bound in space.bounds())
     history = observation["history"].view(-1, HISTORY_LENGTH + 1, FRAME_SIZE).clone()
     buffers = trainer.environment.buffers
@@ -132,10 +121,10 @@ def test_the_teacher_sees_the_corrected_velocity_in_every_frame(tmp_path: Path) 
         walks = command[:, VELOCITY].norm(dim=1) >= 0.1
         assert walks.any() and not walks.all()
         first = columns(FRAME, block).start
-        added = (further + moved * walks[:, None]) * 2.0 / (upper - lower)
+        added = moved * walks[:, None] * 2.0 / (upper - lower)
         history[:, :, first : first + 3] += added[:, None]
     wanted = trainer.ppo.deterministic(observation | {"history": history.flatten(1)})
-    label = ToldTeacher(trainer.ppo, space, correction).label(observation, further)
+    label = ToldTeacher(trainer.ppo, space, correction).label(observation)
     assert torch.allclose(label, wanted, atol=1e-6)
     assert not torch.allclose(label, trainer.ppo.deterministic(observation), atol=1e-5)
 
@@ -160,7 +149,7 @@ def parts(lines: list[str]) -> list[str]:
 
 
 def test_a_stage_begins_with_a_calibration(tmp_path: Path) -> None:
-    quick = CalibrationConfig(steps=250, settling=0.1, epochs=2)
+    quick = CalibrationConfig(commands=160, duration=0.2, averaged=0.1, epochs=2)
     _, lines = begun(tmp_path / "plain", WALKING, quick)
     assert parts(lines) == ["calibrating", "calibrated", "cloning:"]
     trainer, lines = begun(tmp_path / "prior", replace(WALKING, prior=GaitPriorConfig()), quick)
@@ -172,8 +161,8 @@ def test_a_stage_begins_with_a_calibration(tmp_path: Path) -> None:
         assert torch.equal(resumed.ppo.actor.state_dict()[name], values)
 
 
-def test_without_lasting_commands_there_is_no_calibration(tmp_path: Path) -> None:
-    _, lines = begun(tmp_path, WALKING, CalibrationConfig(steps=20))
+def test_without_enough_commands_there_is_no_calibration(tmp_path: Path) -> None:
+    _, lines = begun(tmp_path, WALKING, CalibrationConfig(commands=32, duration=0.2, averaged=0.1))
     assert [line.split()[:2] for line in lines] == [["calibrating", "the"], ["no", "calibration:"]]
 
 

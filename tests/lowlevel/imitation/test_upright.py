@@ -53,10 +53,11 @@ def act(teacher: UprightTeacher, environment: PilotEnvironment, seconds: float) 
 
 
 def test_a_torso_that_sags_is_brought_up(environment: PilotEnvironment) -> None:
-    teacher = UprightTeacher(Still(), environment, UprightConfig(rate=1.0, settling=0.5))
+    teacher = UprightTeacher(Still(), environment, UprightConfig(rate=1.0, leak=0.25, settling=0.5))
     assert (act(teacher, environment, 0.48) == 0.0).all()  # not settled yet
-    assert torch.allclose(act(teacher, environment, 1.0), torch.full((2,), -0.63 * SAG), atol=0.01)
-    assert torch.allclose(act(teacher, environment, 5.0), torch.full((2,), -SAG), atol=0.01)
+    # It approaches 1 / (1 + 0.25) of the way as exp(-1.25 t).
+    assert torch.allclose(act(teacher, environment, 0.8), torch.full((2,), -0.8 * 0.63 * SAG), atol=0.01)
+    assert torch.allclose(act(teacher, environment, 5.0), torch.full((2,), -0.8 * SAG), atol=0.01)
 
 
 def test_a_correction_is_limited_and_forgotten_with_its_episode(environment: PilotEnvironment) -> None:

@@ -63,7 +63,8 @@ def _rank(rank: int, folder: str) -> None:
     different = torch.full((3,), float(rank))
     distributed.broadcast([different])
     stops = [distributed.any_rank(rank == 1), distributed.any_rank(False)]
-    result |= {"mixed": mixed, "broadcast": different, "stops": stops}
+    rows = distributed.gathered(torch.full((1 + rank, 2), float(rank)))
+    result |= {"mixed": mixed, "broadcast": different, "stops": stops, "rows": rows}
     torch.save(result, f"{folder}/rank{rank}.pt")
     distributed.stop()
 
@@ -81,6 +82,7 @@ def test_two_ranks_learn_what_one_process_learns_from_all_robots(tmp_path: Path)
     for rank in (first, second):
         assert torch.equal(rank["mixed"][0], torch.full((2, 2), 0.5)) and float(rank["mixed"][1]) == 5.0
         assert torch.equal(rank["broadcast"], torch.zeros(3))
+        assert rank["rows"].tolist() == [[0.0, 0.0], [1.0, 1.0], [1.0, 1.0]]
         assert rank["stops"] == [True, False], "all ranks must stop when one is asked to"
     single = _learn(slice(0, ROBOTS))
     modules = ("actor", "critic", "target_encoder")
@@ -104,7 +106,8 @@ def test_one_process_needs_no_group(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (distributed.rank(), distributed.world_size()) == (0, 1)
     values = torch.arange(3.0)
     distributed.average_over_ranks([values])
-    assert distributed.sum_over_ranks(values) is values and values.tolist() == [0, 1, 2]
+    assert distributed.sum_over_ranks(values) is values and distributed.gathered(values) is values
+    assert values.tolist() == [0, 1, 2]
     distributed.stop()
 
 
