@@ -139,3 +139,13 @@ def test_a_stage_makes_its_conditions_harder(tmp_path: Path) -> None:
     resumed = Trainer(trainer.config, tmp_path)
     resumed.load()
     assert resumed.environment.randomizer.config == trainer.environment.randomizer.config
+
+
+def test_conditions_begin_easily_with_every_stage_that_hardens_them(tmp_path: Path) -> None:
+    easy = RandomizationConfig.for_evaluation()
+    hardening = replace(SECOND, randomization=easy, harder=RandomizationConfig())
+    trainer = Trainer(replace(tiny(replace(FIRST, most_steps=64), hardening), total_steps=64), tmp_path)
+    trainer.curriculum.hardness = torch.tensor(0.7)
+    trainer.train()
+    assert trainer.stage.name == "second"
+    assert float(trainer.curriculum.hardness) == 0.0 and trainer.environment.randomizer.config == easy
