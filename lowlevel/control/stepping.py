@@ -11,9 +11,8 @@ from torch import Tensor
 
 FARTHEST = 0.09
 """Distance of the estimated capture point from the middle between the soles at which a robot steps [m]. The estimate
-follows a push by 0.1 s late. At 0.12, 0.09 and 0.07 m one of 256 pushes by 0.6 m/s felled 59, 7 and 2 robots that
-stand, robots that stand and work fell 25, 6 and 11 times in 115,000 control steps, and they stepped 4, 9 and 20 times a
-minute."""
+follows a push 0.1 s late. At 0.12, 0.09 and 0.07 m a push of 0.6 m/s felled 60, 7 and 2 of 256 robots that stood;
+robots that stand and work fell 25, 6 and 11 times in 115,000 control steps, and stepped 4, 9 and 20 times a minute."""
 
 
 def swing_first(capture_point: Tensor) -> Tensor:

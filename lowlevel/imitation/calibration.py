@@ -4,7 +4,8 @@ A trained policy walks at a velocity of its own for every command, the same when
 lasting errors in two tries agree to 0.015 m/s, of 0.12 m/s. So it does not lack a reaction; it has a wrong answer to
 the command, which 135 million steps of PPO had not mended. The error is measured for some ten thousand commands, and
 fitted as a function of the command. The policy that is told what takes it away is cloned into the policy itself, which
-needs no fit afterwards (iterative learning control; Bristow et al., IEEE Control Systems 26(3), 2006).
+needs no fit afterwards (iterative learning control; Bristow et al., IEEE Control Systems 26(3), 2006). The clone keeps
+a part of it only: it comes as near to its teacher as that one is to the policy.
 """
 
 from __future__ import annotations
