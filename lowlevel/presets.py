@@ -280,8 +280,8 @@ STAGES = (
     ),
 )
 """From nothing to the controller: balance with a gait prior, walk with it, absorb it, steer, then open one kind of
-command after the other, absorb better answers, walk as told, then everything with disturbances and on uneven ground, at
-last with less noise and without shaping."""
+command after the other, absorb better answers, walk as told, hold loads, catch itself after pushes, then everything
+with disturbances and on uneven ground, at last with less noise and without shaping."""
 
 
 OBSTACLES = TerrainConfig(

@@ -29,6 +29,7 @@ from lowlevel.runs.distributed import broadcast, gathered, rank, world_size
 from lowlevel.runs.precision import coarse_products
 from lowlevel.world.measures import velocity_error
 from lowlevel.world.randomization import RandomizationConfig
+from robots.errors import PilotError
 
 _COMMAND, _SLEWED = columns(FRAME, "command"), columns(FRAME, "slewed_command")
 _TOLD = [slice(block.start, block.start + VELOCITY.stop) for block in (_COMMAND, _SLEWED)]
@@ -53,6 +54,14 @@ class CalibrationConfig:
     epochs: int = 120
     """Passes of the fit over the commands that were measured."""
     upright: UprightConfig = field(default_factory=UprightConfig)
+
+    def __post_init__(self) -> None:
+        if self.commands < 1:
+            raise PilotError(f"a calibration takes at least one command, not {self.commands}")
+        if not 0.0 < self.averaged <= self.duration:
+            raise PilotError(
+                f"a calibration averages over a part of the {self.duration} s of a command, not {self.averaged} s"
+            )
 
 
 class Correction(nn.Module):

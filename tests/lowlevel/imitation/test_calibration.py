@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -23,6 +24,7 @@ from lowlevel.rewards import RewardWeights
 from lowlevel.stages import Stage
 from lowlevel.trainer import Trainer, TrainingConfig
 from lowlevel.world.randomization import RandomizationConfig
+from robots.errors import PilotError
 
 WALKING = Stage(name="walk", mixture=(("walk", 1.0),), rewards=RewardWeights(alive=1.0))
 
@@ -175,3 +177,12 @@ def test_what_the_fit_knows_nothing_about_is_left_alone(space: CommandSpace) -> 
     assert explained[1] < 0.0 < min(explained[0], explained[2])
     assert correction.known.tolist() == [1.0, 0.0, 1.0]
     assert not correction(command)[:, 1].any() and correction(command)[:, 0].any()
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [({"commands": 0}, "at least one"), ({"duration": 1.0}, "not 1.5 s"), ({"averaged": 0.0}, "not 0.0")],
+)
+def test_a_calibration_that_measures_nothing_is_refused(setting: dict[str, Any], message: str) -> None:
+    with pytest.raises(PilotError, match=message):
+        CalibrationConfig(**setting)
