@@ -91,7 +91,7 @@ def _run(arguments: Arguments) -> None:
 
 
 def draw(
-    controller: WholeBodyController, seed: int, supports: Supports | None = None, tile: str = "irregular"
+    controller: WholeBodyController, seed: int, supports: Supports | None = None, tile: str = "slabs"
 ) -> tuple[np.ndarray, list[str]]:
     """One strip with a picture of each of :data:`POSES`, left to right, and the names of those in which it has fallen.
 

@@ -66,9 +66,9 @@ PILOT_ON_COMPLEX_GROUND = {
     "E_stumble": 0.006,
 }
 SUITES: dict[str, Suite] = {
-    "simple": Suite(TerrainConfig(("flat", "irregular"), tile_size=TILE_SIZE), BLIND_ON_SIMPLE_GROUND, "blind"),
+    "simple": Suite(TerrainConfig(("flat", "slabs"), tile_size=TILE_SIZE), BLIND_ON_SIMPLE_GROUND, "blind"),
     "flat": Suite(TerrainConfig(("flat",), tile_size=TILE_SIZE)),
-    "slabs": Suite(TerrainConfig(("irregular",), tile_size=TILE_SIZE)),
+    "slabs": Suite(TerrainConfig(("slabs",), tile_size=TILE_SIZE)),
     "full": Suite(crossing.TERRAIN, PILOT_ON_COMPLEX_GROUND, "PILOT, complex terrain", crosses=True),
 }
 

@@ -61,7 +61,7 @@ def flat(size: float, level: float, rng: np.random.Generator) -> list[Block]:
     return []
 
 
-def irregular(size: float, level: float, rng: np.random.Generator) -> list[Block]:
+def slabs(size: float, level: float, rng: np.random.Generator) -> list[Block]:
     """Slabs of 0.4 m with heights within +-2 cm of their mean at level 1."""
     slab = 0.4
     count = round(size / slab)
@@ -129,7 +129,7 @@ def platform(size: float, level: float, rng: np.random.Generator) -> list[Block]
 
 
 TileFunction = Callable[[float, float, np.random.Generator], list[Block]]
-TILES: dict[str, TileFunction] = {tile.__name__: tile for tile in (flat, irregular, rough, slope, stairs, platform)}
+TILES: dict[str, TileFunction] = {tile.__name__: tile for tile in (flat, slabs, rough, slope, stairs, platform)}
 """Kinds of tile by name. A tile is blocks around its own center; the terrain places them."""
 
 

@@ -221,7 +221,7 @@ def test_activations_are_averaged_by_mode(arena: Arena, controller: Controller) 
 
 
 def test_suites() -> None:
-    assert suite_of("simple").terrain.tiles == ("flat", "irregular")
+    assert suite_of("simple").terrain.tiles == ("flat", "slabs")
     with pytest.raises(ValueError, match="unknown suite 'hard'; choose one of simple, flat, slabs, full"):
         suite_of("hard")
 

@@ -66,7 +66,7 @@ def roll_out(environment: PilotEnvironment, steps: int, scale: float = 0.3) -> l
 
 
 def test_observations_have_the_announced_shapes_and_are_finite() -> None:
-    environment = small(terrain=TerrainConfig(tiles=("flat", "irregular")))
+    environment = small(terrain=TerrainConfig(tiles=("flat", "slabs")))
     observation = environment.reset()
     shapes = {name: tuple(value.shape) for name, value in observation.items()}
     history = FRAME_SIZE * (HISTORY_LENGTH + 1)
@@ -88,7 +88,7 @@ def test_same_seed_same_rollout_other_seed_other_rollout() -> None:
 
 
 def test_restored_state_continues_bit_exactly() -> None:
-    environment = small(5, terrain=TerrainConfig(tiles=("irregular",)))
+    environment = small(5, terrain=TerrainConfig(tiles=("slabs",)))
     roll_out(environment, 15)
     saved = environment.state_dict()
     saved = {
@@ -97,7 +97,7 @@ def test_restored_state_continues_bit_exactly() -> None:
     }
     actions = 0.3 * torch.randn(40, 6, 29)
     expected = [environment.step(action) for action in actions]
-    other = small(99, terrain=TerrainConfig(tiles=("irregular",)))
+    other = small(99, terrain=TerrainConfig(tiles=("slabs",)))
     other.reset()
     other.load_state_dict(saved)
     for action, before in zip(actions, expected, strict=True):
@@ -266,7 +266,7 @@ def test_a_standing_robot_that_is_pushed_steps() -> None:
 
 
 def test_robots_start_just_above_the_ground_as_fast_as_configured() -> None:
-    slabs = TerrainConfig(tiles=("irregular",))
+    slabs = TerrainConfig(tiles=("slabs",))
     for fastest in (0.0, 0.3):
         started = replace(CALM, start_velocity=fastest)
         environment = quiet(num_robots=64, terrain=slabs, randomization=started)

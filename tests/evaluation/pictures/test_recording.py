@@ -19,7 +19,7 @@ from robots.g1.constants import HAND_BODIES
 
 @pytest.fixture(scope="module")
 def arena(untrained_controller: Path) -> Arena:
-    terrain = TerrainConfig(tiles=("irregular",), tile_size=4.0)
+    terrain = TerrainConfig(tiles=("slabs",), tile_size=4.0)
     return Arena(Controller.load(untrained_controller), terrain, num_threads=1, batch=1)
 
 

@@ -13,7 +13,7 @@ from lowlevel.world.terrain import TILES, Terrain, TerrainConfig
 
 @pytest.fixture(scope="module")
 def terrain() -> Terrain:
-    return Terrain(TerrainConfig(tiles=("flat", "irregular")))
+    return Terrain(TerrainConfig(tiles=("flat", "slabs")))
 
 
 def scene(terrain: Terrain) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -82,7 +82,7 @@ def test_the_highest_ground_is_that_of_the_slabs_within_reach(terrain: Terrain) 
         assert height.item() == pytest.approx(max(tops), abs=1e-6)
 
 
-def test_irregularities_stay_within_two_centimeters_of_their_mean(terrain: Terrain) -> None:
+def test_slabs_stay_within_two_centimeters_of_their_mean(terrain: Terrain) -> None:
     tops = np.array([block.top for block in terrain.blocks])
     assert tops.max() - tops.min() <= 0.04
     assert tops.std() > 0.005

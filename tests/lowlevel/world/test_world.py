@@ -14,7 +14,7 @@ from robots.g1.kinematics import build_model, to_pinocchio
 from robots.g1.model import ModelOptions
 from robots.rotations import rotate_about_vertical
 
-SLABS = TerrainConfig(tiles=("irregular",))
+SLABS = TerrainConfig(tiles=("slabs",))
 
 
 def test_a_robot_stands_as_it_is_told_on_the_highest_ground_under_its_feet() -> None:

@@ -43,7 +43,7 @@ def test_feet_do_not_trip_over_the_borders_of_a_level_floor(toe: float) -> None:
         spec = build_spec(ModelOptions(timestep=0.02 / 3))
         level = 0.0
         if slabs:
-            terrain = Terrain(TerrainConfig(tiles=("irregular",), levels=(0.0,)))
+            terrain = Terrain(TerrainConfig(tiles=("slabs",), levels=(0.0,)))
             terrain.add_to(spec)
             level = terrain.blocks[0].top
         model = spec.compile()
