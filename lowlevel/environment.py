@@ -27,6 +27,7 @@ from lowlevel.control.observation import (
 )
 from lowlevel.control.reference import Reference, ReferenceConfig, ReferenceState
 from lowlevel.control.stepping import swing_first
+from lowlevel.control.velocity_correction import VelocityCorrection
 from lowlevel.gait_prior import GaitPrior
 from lowlevel.rewards import Transition, compute_rewards, tracking_quality
 from lowlevel.task import TaskConfig
@@ -104,6 +105,7 @@ class PilotEnvironment:
         task: what they are to do.
         seed: seed of commands, noise, randomization and resets.
         device: where tensors live.
+        correction: what the policy is told instead of the commanded velocity; nothing else by default.
     """
 
     def __init__(
@@ -112,6 +114,7 @@ class PilotEnvironment:
         task: TaskConfig = TaskConfig(),  # noqa: B008 (frozen)
         seed: int = 0,
         device: torch.device | str = "cpu",
+        correction: VelocityCorrection | None = None,
     ) -> None:
         self.config, self.task = config, task
         self.device = torch.device(device)
@@ -125,6 +128,7 @@ class PilotEnvironment:
         lower, upper = self.simulation.joint_lower, self.simulation.joint_upper
         self.command_space = command_space(lower.tolist(), upper.tolist())
         self.sampler = CommandSampler(self.command_space, device)
+        self.correction = VelocityCorrection(self.command_space).to(device) if correction is None else correction
         followed = ReferenceConfig(gait_frequency=task.gait_frequency)
         self.reference = Reference(followed, gains, self.control_period, device)
         self.prior = None if task.prior is None else GaitPrior(task.prior, device)
@@ -347,7 +351,8 @@ class PilotEnvironment:
         """The observation, after pushing a noisy frame, restarting new histories and refreshing the map (10 Hz)."""
         buffers, view = self.buffers, self._view(measured, ground)
         noise = self._noise * self._uniform(-1.0, 1.0, self.num_robots, len(self._noise))
-        frame = build(FRAME, replace(view, proprioception=view.proprioception.with_noise(noise)))
+        told = self.correction.tell(replace(view, proprioception=view.proprioception.with_noise(noise)))
+        frame = build(FRAME, told)
         buffers.history, buffers.capture_point = push_history(buffers.history, frame), measured.capture_point
         if len(new_episodes):
             buffers.history[new_episodes] = start_history(frame[new_episodes])

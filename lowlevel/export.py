@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,7 @@ def export_controller(trainer: Trainer, folder: Path, revision: str | None = Non
     policy = PolicyConfig(environment.reference.config, trainer.config.network, pose.axes)
     actor = PilotActor(actor_sizes(), policy.network, ~normalized_columns(FRAME))
     actor.load_state_dict({name: tensor.cpu() for name, tensor in trainer.ppo.actor.state_dict().items()})
+    correction = copy.deepcopy(environment.correction).cpu()
     if not trainer.stage.arms_act:
         actor.silence(ARM_JOINTS)
     provenance: dict[str, Any] = {
@@ -65,7 +67,7 @@ def export_controller(trainer: Trainer, folder: Path, revision: str | None = Non
         "revision": git_revision() if revision is None else revision,
         "torch": torch.__version__,
     }
-    save_controller(folder, config, policy, build_step(config, policy, actor, pose, "cpu"), provenance)
+    save_controller(folder, config, policy, build_step(config, policy, actor, correction, pose, "cpu"), provenance)
 
 
 def export_run(run: Path, controller: Path) -> None:

@@ -21,9 +21,10 @@ from lowlevel.control.observation import (
     columns,
     normalized_columns,
 )
+from lowlevel.control.velocity_correction import VelocityCorrection
 from lowlevel.curriculum import Curriculum, CurriculumConfig
 from lowlevel.environment import EnvironmentConfig, PilotEnvironment, StepResult
-from lowlevel.imitation.calibration import CalibrationConfig, calibrate
+from lowlevel.imitation.calibration import CalibrationConfig, calibrate, correct
 from lowlevel.imitation.cloning import CloningConfig, PriorTeacher, clone
 from lowlevel.learning.ppo import PPO, PPOConfig
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes
@@ -122,6 +123,7 @@ class Trainer:
         self.steps = 0
         self.trained_seconds = 0.0
         self.observation: dict[str, Tensor] = {}
+        self._correction: VelocityCorrection | None = None
         self._stop_requested = False
         self._begin_stage(0)
 
@@ -134,7 +136,8 @@ class Trainer:
         self.waited_for = 0.0
         stage = self.stage
         seed = self.config.seed + 7919 * rank() + 104729 * number
-        self.environment = PilotEnvironment(self.config.environment, stage, seed)
+        self.environment = PilotEnvironment(self.config.environment, stage, seed, correction=self._correction)
+        self._correction = self.environment.correction
         self._shares, self._tile_shares = shares(stage.mixture), tile_shares(stage.terrain)
         acting = NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop
         self.ppo.enter(
@@ -193,10 +196,13 @@ class Trainer:
     # -- the loop ---------------------------------------------------------------------------------------------
 
     def train(self) -> None:
-        """Run until ``total_steps``, a signal, or an error; the training state is saved in every case but the last."""
+        """Run until ``total_steps``, a signal, or an error; the training state is saved in every case but the last.
+
+        At ``total_steps`` a policy that was ever calibrated is told velocities that suit what it is then.
+        """
         if not self.observation:
             self.observation = self.environment.reset(spread_episodes=True)
-        last_save = time.monotonic()
+        last_save, trained = time.monotonic(), self.steps < self.config.total_steps
         progress = ProgressReport(hidden=rank() != 0)
         task = progress.add_task("starting", total=self.config.total_steps, completed=self.steps)
         if rank() == 0:
@@ -219,7 +225,16 @@ class Trainer:
                 if time.monotonic() - last_save > self.config.save_interval:
                     self.save()
                     last_save = time.monotonic()
+            if trained and self.steps >= self.config.total_steps:
+                self._correct_once_more(progress.say)
             self.save()
+
+    def _correct_once_more(self, report: Callable[[str], None]) -> None:
+        """Correct what has changed since the last calibration, if there has been one."""
+        if any(stage.calibrates for stage in self.config.stages[: self.stage_number + 1]):
+            started = time.monotonic()
+            correct(self.ppo, self.environment, self.config.calibration, report)
+            self.trained_seconds += time.monotonic() - started
 
     @property
     def _steps_per_iteration(self) -> int:
@@ -269,6 +284,7 @@ class Trainer:
             "steps": self.steps,
             "trained_seconds": self.trained_seconds,
             "action_scale": self.environment.action_scale.cpu(),
+            "correction": self.environment.correction.state_dict(),
             "stage": self.stage_number,
             "stage_begin": self.stage_begin,
             "waited_for": self.waited_for,
@@ -306,6 +322,7 @@ class Trainer:
             raise PilotError(
                 f"the state in {self.run.path} is of another version: its curriculum has no {error}"
             ) from error
+        self.environment.correction.load_state_dict(state["correction"])
         self.steps, self.trained_seconds = int(state["steps"]), float(state["trained_seconds"])
         self._begin_stage(int(state["stage"]))
         self.stage_begin, self.waited_for = int(state["stage_begin"]), float(state["waited_for"])
@@ -324,6 +341,9 @@ class Trainer:
         state = blind.load()
         if not torch.equal(state["action_scale"], self.environment.action_scale.cpu()):
             raise PilotError(f"{blind.path} was trained with other action scales than those of these gains")
+        if "correction" not in state:
+            raise PilotError(f"the state in {blind.path} is of another version: it has no 'correction'")
+        self.environment.correction.load_state_dict(state["correction"])
         for name, network in self.ppo.learner.modules.items():
             give_sight(network, state["ppo"][name])
         self.ppo.learner.limit_noise()

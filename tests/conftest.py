@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from some_correction import fill
 
 from highlevel.pictures.painter import NoOpenGLError, find_platform
 from lowlevel.commands import command_space
 from lowlevel.control.controller import ControllerConfig, PolicyConfig, actor_sizes, build_step, save_controller
 from lowlevel.control.observation import FRAME, normalized_columns
 from lowlevel.control.reference import ReferenceConfig
+from lowlevel.control.velocity_correction import VelocityCorrection
 from lowlevel.networks.actor import NetworkConfig, PilotActor
 from robots.g1.constants import DEFAULT_POSITION, GAINS, JOINT_NAMES
 from robots.g1.model import build_spec, joint_limits
@@ -51,6 +53,7 @@ def untrained_controller(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     policy = PolicyConfig(ReferenceConfig(), network, pose.axes)
     actor = PilotActor(actor_sizes(), network, ~normalized_columns(FRAME))
+    correction = fill(VelocityCorrection(config.command_space))
     folder = tmp_path_factory.mktemp("controllers") / "untrained"
-    save_controller(folder, config, policy, build_step(config, policy, actor, pose, "cpu"), provenance={})
+    save_controller(folder, config, policy, build_step(config, policy, actor, correction, pose, "cpu"), provenance={})
     return folder

@@ -25,6 +25,7 @@ from lowlevel.control.observation import (
 )
 from lowlevel.control.reference import Reference, ReferenceState
 from lowlevel.control.stepping import swing_first
+from lowlevel.control.velocity_correction import VelocityCorrection
 from lowlevel.networks.actor import CAPTURE_POINT, PilotActor
 from robots.g1.constants import NUM_JOINTS
 
@@ -52,11 +53,17 @@ class ControlStep(nn.Module):
     """
 
     def __init__(
-        self, actor: PilotActor, reference: Reference, space: CommandSpace, action_scale: Tensor, action_limit: float
+        self,
+        actor: PilotActor,
+        correction: VelocityCorrection,
+        reference: Reference,
+        space: CommandSpace,
+        action_scale: Tensor,
+        action_limit: float,
     ) -> None:
         """``action_scale`` (29,) [rad]; actions are clipped to +- ``action_limit`` of it."""
         super().__init__()
-        self.actor = actor
+        self.actor, self.correction = actor, correction
         self.reference = reference
         self.action_limit = action_limit
         self._space = space
@@ -84,7 +91,8 @@ class ControlStep(nn.Module):
         """One control period, with ``elevation_map`` (N, 121) [m], ``command`` (N, 21) and ``flag`` (N, 1)."""
         command = self.reference.clamp(command)
         state = self.reference.advance(ReferenceState(memory["reference"], memory["phase"]), command)
-        frame = build(FRAME, FrameView(measured, command, memory["action"], state, self._space))
+        view = FrameView(measured, command, memory["action"], state, self._space)
+        frame = build(FRAME, self.correction.tell(view))
         # Gravity is a unit vector in every frame that was ever measured.
         last_gravity = memory["history"][:, -1, columns(FRAME, "projected_gravity")]
         is_first = (last_gravity == 0.0).all(dim=1)[:, None, None]

@@ -36,6 +36,7 @@ from lowlevel.control.observation import (
 )
 from lowlevel.control.onnx_step import OnnxStep, export_step
 from lowlevel.control.reference import Reference, ReferenceConfig
+from lowlevel.control.velocity_correction import VelocityCorrection
 from lowlevel.control.whole_body import Bounds, Supports
 from lowlevel.networks.actor import NetworkConfig, ObservationSizes, PilotActor
 from lowlevel.runs.configs import from_plain
@@ -309,7 +310,7 @@ def save_controller(
     """
     folder = Path(folder)
     pose = {f"nominal_pose.{name}": getattr(step.reference.pose, name) for name in _POSE_TENSORS}
-    _FOLDER.write_weights(folder, step.actor.state_dict() | pose)
+    _FOLDER.write_weights(folder, step.state_dict() | pose)
     controller = Controller(config, step, provenance)
     controller.reset(GOLDEN_ROBOTS)
     golden = golden_vectors(controller, config.command_space, seed=0)
@@ -324,14 +325,19 @@ _POSE_TENSORS = ("values", "roll_limit", "pitch_limits")
 
 
 def build_step(
-    config: ControllerConfig, policy: PolicyConfig, actor: PilotActor, pose: NominalPose, device: torch.device | str
+    config: ControllerConfig,
+    policy: PolicyConfig,
+    actor: PilotActor,
+    correction: VelocityCorrection,
+    pose: NominalPose,
+    device: torch.device | str,
 ) -> ControlStep:
-    """The control step of ``actor`` in torch."""
+    """The control step of ``actor``, told what ``correction`` makes of the command, in torch."""
     scale = torch.tensor(config.action_scale, device=device)
     gains = Gains(np.array(config.stiffness), np.array(config.damping), np.array(config.action_scale))
     reference = Reference(policy.reference, gains, config.control_period, device, pose)
-    frozen = actor.to(device).eval().requires_grad_(False)
-    return ControlStep(frozen, reference, config.command_space, scale, config.action_limit)
+    step = ControlStep(actor, correction, reference, config.command_space, scale, config.action_limit)
+    return step.to(device).eval().requires_grad_(False)
 
 
 def _read_policy(folder: Path, config: ControllerConfig, device: torch.device | str) -> ControlStep:
@@ -344,17 +350,19 @@ def _read_policy(folder: Path, config: ControllerConfig, device: torch.device | 
     except (KeyError, TypeError, ValueError) as error:
         raise ControllerError(f"{path} is incomplete: {error}") from error
     tensors = _FOLDER.read_weights(folder)
-    actor = PilotActor(actor_sizes(), policy.network, ~normalized_columns(FRAME))
     try:
         pose_tensors = [tensors.pop(f"nominal_pose.{name}").to(device) for name in _POSE_TENSORS]
     except KeyError as error:
         raise ControllerError(f"{folder / WEIGHTS_FILE} has no {error}: export the controller again") from error
+    actor = PilotActor(actor_sizes(), policy.network, ~normalized_columns(FRAME))
+    correction = VelocityCorrection(config.command_space)
+    step = build_step(config, policy, actor, correction, NominalPose(policy.pose_axes, *pose_tensors), device)
     try:
-        actor.load_state_dict(tensors)
+        step.load_state_dict(tensors)
     except RuntimeError as error:
         first_line = str(error).splitlines()[-1].strip()
         raise ControllerError(f"{folder / WEIGHTS_FILE} does not fit {CONFIG_FILE}: {first_line}") from error
-    return build_step(config, policy, actor, NominalPose(policy.pose_axes, *pose_tensors), device)
+    return step
 
 
 def actor_sizes() -> ObservationSizes:

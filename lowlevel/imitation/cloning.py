@@ -56,6 +56,20 @@ class Teacher(Protocol):
         """An episode of the ``robots`` (N,) bool has ended."""
 
 
+class PolicyTeacher:
+    """A copy of the policy as it is now."""
+
+    def __init__(self, ppo: PPO) -> None:
+        self._policy = copy.deepcopy(ppo.actor).eval().requires_grad_(False)
+
+    @torch.no_grad()
+    def label(self, observation: dict[str, Tensor]) -> Tensor:
+        return self._policy(observation["history"], observation["elevation_map"], observation["flag"]).mean
+
+    def forget(self, robots: Tensor) -> None:
+        """A policy remembers nothing."""
+
+
 class PriorTeacher:
     """A copy of the policy, and the gait prior under it in a world that has none."""
 

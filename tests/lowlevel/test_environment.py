@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import pytest
 import torch
+from some_correction import fill
 
 from lowlevel import rewards
 from lowlevel.commands import HEIGHT, KINDS
@@ -346,10 +347,11 @@ def test_frozen_controller_repeats_the_training_policy(tmp_path: Path) -> None:
     generator = torch.Generator().manual_seed(0)
     weight = trainer.ppo.actor.head.output_weight
     weight.data += 0.02 * torch.randn(weight.shape, generator=generator)
+    environment = trainer.environment
+    fill(environment.correction)
     export_controller(trainer, tmp_path / "controller")
     controller = Controller.load(tmp_path / "controller")
     controller.reset(6)
-    environment = trainer.environment
     observation = environment.reset()
     for _ in range(25):
         targets = controller.act(

@@ -13,6 +13,7 @@ import onnxruntime
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from some_correction import fill
 
 from lowlevel.control.control_step import ControlStep
 from lowlevel.control.controller import (
@@ -41,6 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     trainer = Trainer(TrainingConfig(environment=EnvironmentConfig(num_robots=6, num_threads=1)), path)
     weight = trainer.ppo.actor.head.output_weight
     weight.data += 0.05 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(0))
+    fill(trainer.environment.correction)
     export_controller(trainer, path / "exported")
     return path / "exported"
 
@@ -275,7 +277,7 @@ def test_truncated_weights_are_refused(copy: Path) -> None:
 
 def test_weights_that_are_not_finite_are_refused_by_name(copy: Path) -> None:
     tensors = load_file(copy / WEIGHTS_FILE)
-    tensors["head.first.weight"][0, 0] = float("nan")
+    tensors["actor.head.first.weight"][0, 0] = float("nan")
     save_file(tensors, copy / WEIGHTS_FILE)
     assert "'head.first.weight'" in refused(copy)
 
@@ -283,14 +285,14 @@ def test_weights_that_are_not_finite_are_refused_by_name(copy: Path) -> None:
 def test_a_controller_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
     trainer = Trainer(TrainingConfig(environment=EnvironmentConfig(num_robots=6, num_threads=1)), tmp_path)
     trainer.ppo.actor.head.output_weight.data[0] = float("inf")
-    with pytest.raises(ControllerError, match=r"'head\.output_weight' is not finite"):
+    with pytest.raises(ControllerError, match=r"'actor\.head\.output_weight' is not finite"):
         export_controller(trainer, tmp_path / "broken")
     assert not (tmp_path / "broken").exists()
 
 
 def test_weights_of_another_network_are_refused(copy: Path) -> None:
     tensors = load_file(copy / WEIGHTS_FILE)
-    tensors["head.first.weight"] = tensors["head.first.weight"][:, :-1].contiguous()
+    tensors["actor.head.first.weight"] = tensors["actor.head.first.weight"][:, :-1].contiguous()
     save_file(tensors, copy / WEIGHTS_FILE)
     assert "does not fit" in refused(copy)
 

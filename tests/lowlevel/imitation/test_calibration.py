@@ -12,11 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from lowlevel.commands import COMMAND_SIZE, MIRROR, VELOCITY, CommandSpace
-from lowlevel.control.observation import FRAME, FRAME_SIZE, HISTORY_LENGTH, columns
+from lowlevel.commands import COMMAND_SIZE, VELOCITY, CommandSpace
+from lowlevel.control.velocity_correction import VelocityCorrection
 from lowlevel.environment import EnvironmentConfig
 from lowlevel.gait_prior import GaitPriorConfig
-from lowlevel.imitation.calibration import CalibrationConfig, Correction, ToldTeacher, fit, measure
+from lowlevel.imitation.calibration import CalibrationConfig, fit, measure
 from lowlevel.imitation.cloning import CloningConfig
 from lowlevel.learning.ppo import PPOConfig
 from lowlevel.networks.config import NetworkConfig
@@ -49,24 +49,11 @@ def some_commands(space: CommandSpace, count: int) -> Tensor:
     return lower + torch.rand(count, COMMAND_SIZE, generator=torch.Generator().manual_seed(0)) * (upper - lower)
 
 
-def test_a_mirrored_command_has_the_mirrored_correction_and_standing_has_none(space: CommandSpace) -> None:
-    correction = Correction(space, limit=0.5)
-    for values in correction.parameters():
-        torch.nn.init.normal_(values, std=0.3)
-    command = some_commands(space, 50)
-    index, sign = torch.as_tensor(MIRROR.index), torch.as_tensor(MIRROR.sign, dtype=command.dtype)
-    found = correction(command)
-    assert found.abs().max() > 0.1
-    assert torch.allclose(correction(command[:, index] * sign), found * sign[VELOCITY], atol=1e-6)
-    command[:, VELOCITY] = 0.02
-    assert not correction(command).any()
-
-
 def test_the_fit_finds_what_is_wanted(space: CommandSpace) -> None:
     """A robot that walks at 0.8, 0.7 and 0.9 of what it is told."""
     command = some_commands(space, 3000)
     wanted = command[:, VELOCITY] * torch.tensor([0.25, 0.43, 0.11])
-    correction = Correction(space, limit=0.5)
+    correction = VelocityCorrection(space)
     explained = fit(correction, command, wanted, epochs=30, generator=torch.Generator().manual_seed(0))
     assert min(explained) > 0.9
 
@@ -108,29 +95,6 @@ def test_the_lasting_error_of_each_command_is_measured(space: CommandSpace) -> N
     assert torch.allclose(errors, (share[1:-1, None].repeat(2, 1) - 1.0) * told[:, VELOCITY], atol=1e-5)
 
 
-def test_the_teacher_sees_the_corrected_velocity_in_every_frame(tmp_path: Path) -> None:
-    trainer = Trainer(small(WALKING), tmp_path)
-    observation = trainer.environment.reset()
-    space = trainer.environment.command_space
-    correction = Correction(space, limit=0.5)
-    moved = torch.tensor([0.1, 0.0, 0.0])
-    with torch.no_grad():
-        list(correction.parameters())[-1][:] = moved
-    lower, upper = (bound[VELOCITY] for bound in space.bounds())
-    history = observation["history"].view(-1, HISTORY_LENGTH + 1, FRAME_SIZE).clone()
-    buffers = trainer.environment.buffers
-    for block, command in (("command", buffers.command), ("slewed_command", buffers.reference.command)):
-        walks = command[:, VELOCITY].norm(dim=1) >= 0.1
-        assert walks.any() and not walks.all()
-        first = columns(FRAME, block).start
-        added = moved * walks[:, None] * 2.0 / (upper - lower)
-        history[:, :, first : first + 3] += added[:, None]
-    wanted = trainer.ppo.deterministic(observation | {"history": history.flatten(1)})
-    label = ToldTeacher(trainer.ppo, space, correction).label(observation)
-    assert torch.allclose(label, wanted, atol=1e-6)
-    assert not torch.allclose(label, trainer.ppo.deterministic(observation), atol=1e-5)
-
-
 def begun(tmp_path: Path, first: Stage, calibration: CalibrationConfig) -> tuple[Trainer, list[str]]:
     """A trainer that has just begun a stage with calibration after ``first``, and what it reported."""
     calibrated = replace(WALKING, name="calibrated", calibrates=True)
@@ -159,8 +123,25 @@ def test_a_stage_begins_with_a_calibration(tmp_path: Path) -> None:
     resumed = Trainer(trainer.config, tmp_path / "prior")
     resumed.load()
     assert resumed.stage.name == "calibrated"
+    for name, values in trainer.environment.correction.state_dict().items():
+        assert torch.equal(resumed.environment.correction.state_dict()[name], values)
     for name, values in trainer.ppo.actor.state_dict().items():
         assert torch.equal(resumed.ppo.actor.state_dict()[name], values)
+
+
+def test_a_run_ends_with_a_correction_of_what_came_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = CalibrationConfig(commands=160, duration=0.2, averaged=0.1, epochs=2)
+    lines: list[str] = []
+    monkeypatch.setattr("lowlevel.runs.progress.ProgressReport.say", lambda self, line: lines.append(line))
+    for calibrates, expected in ((False, []), (True, ["calibrating", "calibrated"])):
+        config = replace(small(replace(WALKING, calibrates=calibrates), robots=32), calibration=quick, total_steps=1)
+        trainer = Trainer(config, tmp_path / str(calibrates))
+        trainer.train()
+        assert trainer.steps > 1 and parts(lines) == expected
+        resumed = Trainer(config, tmp_path / str(calibrates))
+        resumed.load()
+        resumed.train()  # has nothing left to do
+        assert parts(lines) == expected
 
 
 def test_without_enough_commands_there_is_no_calibration(tmp_path: Path) -> None:
@@ -172,7 +153,7 @@ def test_what_the_fit_knows_nothing_about_is_left_alone(space: CommandSpace) -> 
     command = some_commands(space, 600)
     noise = torch.randn(600, generator=torch.Generator().manual_seed(1))
     wanted = torch.stack([0.25 * command[:, 0], 0.3 * noise, 0.11 * command[:, 2]], dim=1)
-    correction = Correction(space, limit=0.5)
+    correction = VelocityCorrection(space)
     explained = fit(correction, command, wanted, epochs=30, generator=torch.Generator().manual_seed(0))
     assert explained[1] < 0.0 < min(explained[0], explained[2])
     assert correction.known.tolist() == [1.0, 0.0, 1.0]
