@@ -113,6 +113,15 @@ CATCHING = (
 )
 """Mostly for pushes, which fell a robot that stands before any other."""
 
+CLEARING = (
+    ("forward", 0.2),
+    ("steer", 0.3),
+    ("stand", 0.1),
+    ("stand_and_work", 0.1),
+    ("walk_and_work", 0.3),
+)
+"""Mostly to walk, for feet that run into edges."""
+
 UNEVEN = TerrainConfig(tiles=("flat", "rough"), levels=(1.0 / 3.0,), tile_size=8.0)
 """Like the simple terrain of the paper: flat, and steps of up to 4 cm, made of a tenth of the blocks that
 the slabs of the evaluation take."""
@@ -261,6 +270,16 @@ STAGES = (
         randomization=replace(GENTLE, hand_load_probability=0.4, standing_push_velocity=0.4),
     ),
     Stage(
+        name="clear",
+        most_steps=10_000_000,
+        std=(0.15, 0.2),
+        noise_at_rest=0.5,
+        mixture=CLEARING,
+        terrain=replace(UNEVEN, tiles=("rough",)),
+        rewards=replace(EXACT, low_swing=-8.0),
+        randomization=replace(GENTLE, hand_load_probability=0.4, standing_push_velocity=0.4),
+    ),
+    Stage(
         name="settle",
         calibrates=True,  # what a robot answers in much noise is not what it answers in little
         waits_for="curriculum/hardness",
@@ -300,8 +319,8 @@ STAGES = (
     ),
 )
 """From nothing to the controller: balance with a gait prior, walk with it, absorb it, steer, then open one kind of
-command after the other, absorb better answers, walk as told, hold loads, catch itself after pushes, walk fast, then
-everything with disturbances and on uneven ground, at last with less noise and without shaping."""
+command after the other, absorb better answers, walk as told, hold loads, catch itself after pushes, walk fast, clear
+edges, then everything with disturbances and on uneven ground, at last with less noise and without shaping."""
 
 
 OBSTACLES = TerrainConfig(

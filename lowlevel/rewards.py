@@ -51,6 +51,7 @@ class RewardWeights:
     # Additions: what nothing above forbids
     vertical_velocity: float = 0.0
     base_motion: float = 0.0
+    low_swing: float = 0.0
     feet_close: float = 0.0
     stand_still: float = 0.0
     torque_limits: float = 0.0
@@ -261,6 +262,16 @@ def capture_point(t: Transition, width: float = 0.1) -> Tensor:
 def vertical_velocity(t: Transition) -> Tensor:
     """Squared vertical velocity of the pelvis while walking [m^2/s^2]; a squat is no fault."""
     return t.measured.linear_velocity[:, 2].square() * t.walking
+
+
+def low_swing(t: Transition, height: float = SWING_HEIGHT) -> Tensor:
+    """Horizontal speed of the feet [m/s] times the squared share of ``height`` [m] that they lack.
+
+    A kernel on heights pays a foot for being high at mid-swing; what runs into an edge is one that is still fast when
+    it is low again.
+    """
+    lacking = (1.0 - t.measured.foot_clearance / height).clamp(0.0, 1.0)
+    return (lacking.square() * t.measured.foot_velocity[..., :2].norm(dim=-1)).sum(-1)
 
 
 def feet_close(t: Transition, distance: float = 0.15) -> Tensor:

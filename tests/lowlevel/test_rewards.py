@@ -113,6 +113,15 @@ def test_gait_terms_follow_the_clock(standing: Transition) -> None:
     assert term("swing_height", still) == [0.0] * 4
 
 
+def test_a_swing_is_low_where_a_fast_foot_lacks_height(standing: Transition) -> None:
+    velocity = torch.zeros(4, 2, 3)
+    velocity[:, 0, 0], velocity[:3, 1, 1] = 1.0, 0.5
+    velocity[:, 0, 2] = 3.0  # upwards is no fault
+    clearance = torch.tensor([[0.08, 0.1], [0.02, 0.08], [0.04, 0.04], [-0.01, 0.0]])
+    feet = moved(standing, foot_velocity=velocity, foot_clearance=clearance)
+    assert term("low_swing", feet) == pytest.approx([0.0, 0.5625, 0.25 * 1.5, 1.0])
+
+
 def test_feet_are_to_be_where_the_told_velocity_needs_them(standing: Transition) -> None:
     """At 0.5 m/s and 1.25 Hz the robot goes 0.4 m per cycle, so that landing feet are 0.2 m apart along the heading."""
     command = standing.command.index_fill(1, torch.tensor([0]), 0.5)
