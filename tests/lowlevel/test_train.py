@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from some_correction import fill
 
 from lowlevel.control.controller import Controller
 from lowlevel.environment import EnvironmentConfig
@@ -74,9 +75,12 @@ def test_a_run_that_sees_begins_with_what_a_blind_one_does(tmp_path: Path) -> No
     (tmp_path / "blind").mkdir()
     blind = Trainer(tiny(network=replace(TINY_NETWORK, vision=False)), tmp_path / "blind")
     run(blind, 2)
+    fill(blind.environment.correction)
     blind.save()
     seeing = Trainer(tiny(seed=3), tmp_path / "seeing")
     seeing.begin_seeing(blind.run)
+    for name, values in blind.environment.correction.state_dict().items():
+        assert torch.equal(seeing.environment.correction.state_dict()[name], values)
     observation = blind.environment.reset()
     torch.testing.assert_close(seeing.ppo.deterministic(observation), blind.ppo.deterministic(observation))
     torch.testing.assert_close(
@@ -86,6 +90,9 @@ def test_a_run_that_sees_begins_with_what_a_blind_one_does(tmp_path: Path) -> No
     assert figures[-1]["learner/kl"] < 1.0
     with pytest.raises(PilotError, match="choose --preset vision"):
         blind.begin_seeing(blind.run)
+    blind.run.save({name: part for name, part in blind.state_dict().items() if name != "correction"})
+    with pytest.raises(PilotError, match="another version: it has no 'correction'"):
+        seeing.begin_seeing(blind.run)
 
 
 def test_only_networks_multiply_coarsely(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
