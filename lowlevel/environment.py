@@ -8,14 +8,7 @@ import torch
 from torch import Tensor
 
 from lowlevel.buffers import Buffers
-from lowlevel.commands import (
-    HEIGHT,
-    KINDS,
-    VELOCITY,
-    CommandSampler,
-    command_space,
-    shares,
-)
+from lowlevel.commands import HEIGHT, KINDS, VELOCITY, CommandSampler, command_space, shares
 from lowlevel.control.observation import (
     FRAME,
     MAP_REFRESH_STEPS,

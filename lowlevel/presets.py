@@ -67,6 +67,9 @@ GENTLE = RandomizationConfig(
 )
 """For a robot that still learns to walk, or what falls without any push."""
 
+LOADED = replace(GENTLE, hand_load_probability=0.4)
+"""For one that moves safely in all postures: loads in the hands of some."""
+
 HARD = RandomizationConfig()
 """For a controller that is to be shipped: loads in the hands, late and weak motors, slippery ground, hard pushes."""
 
@@ -86,12 +89,7 @@ EVERYTHING = (
 """Unlike the evaluation it also stands in the neutral posture, what a planner starts from and stops in, walks slowly,
 walks straight on, where it is fastest, and holds both arms before its chest, as around a box."""
 
-HOLDING = (
-    ("steer", 0.15),
-    ("stand_and_work", 0.15),
-    ("stand_and_hold", 0.5),
-    ("walk_and_hold", 0.2),
-)
+HOLDING = (("steer", 0.15), ("stand_and_work", 0.15), ("stand_and_hold", 0.5), ("walk_and_hold", 0.2))
 """Mostly for loads before the chest: under them a robot that has learned everything at once leans forwards."""
 
 HASTENING = (
@@ -113,13 +111,7 @@ CATCHING = (
 )
 """Mostly for pushes, which fell a robot that stands before any other."""
 
-CLEARING = (
-    ("forward", 0.2),
-    ("steer", 0.3),
-    ("stand", 0.1),
-    ("stand_and_work", 0.1),
-    ("walk_and_work", 0.3),
-)
+CLEARING = (("forward", 0.2), ("steer", 0.3), ("stand", 0.1), ("stand_and_work", 0.1), ("walk_and_work", 0.3))
 """Mostly to walk, for feet that run into edges."""
 
 UNEVEN = TerrainConfig(tiles=("flat", "rough"), levels=(1.0 / 3.0,), tile_size=8.0)
@@ -239,7 +231,7 @@ STAGES = (
         noise_at_rest=0.4,
         mixture=EVERYTHING,
         rewards=EXACT,
-        randomization=replace(GENTLE, hand_load_probability=0.4),
+        randomization=LOADED,
         harder=HARD,
     ),
     Stage(
@@ -258,7 +250,7 @@ STAGES = (
         noise_at_rest=0.6,
         mixture=CATCHING,
         rewards=EXACT,
-        randomization=replace(GENTLE, hand_load_probability=0.4, standing_push_velocity=0.8, push_interval=(2.0, 5.0)),
+        randomization=replace(LOADED, standing_push_velocity=0.8, push_interval=(2.0, 5.0)),
     ),
     Stage(
         name="hasten",
@@ -267,7 +259,7 @@ STAGES = (
         noise_at_rest=0.5,
         mixture=HASTENING,
         rewards=EXACT,
-        randomization=replace(GENTLE, hand_load_probability=0.4, standing_push_velocity=0.4),
+        randomization=replace(LOADED, standing_push_velocity=0.4),
     ),
     Stage(
         name="clear",
@@ -277,7 +269,7 @@ STAGES = (
         mixture=CLEARING,
         terrain=replace(UNEVEN, tiles=("rough",)),
         rewards=replace(EXACT, low_swing=-8.0),
-        randomization=replace(GENTLE, hand_load_probability=0.4, standing_push_velocity=0.4),
+        randomization=replace(LOADED, standing_push_velocity=0.4),
     ),
     Stage(
         name="settle",
@@ -290,7 +282,7 @@ STAGES = (
         noise_at_rest=0.6,
         mixture=EVERYTHING,
         rewards=EXACT,
-        randomization=replace(GENTLE, hand_load_probability=0.4),
+        randomization=LOADED,
         harder=HARD,
     ),
     Stage(
@@ -351,7 +343,7 @@ SEEING_STAGES = (
         mixture=CROSSING,
         terrain=OBSTACLES,
         rewards=EXACT,
-        randomization=replace(GENTLE, hand_load_probability=0.4),
+        randomization=LOADED,
     ),
     Stage(
         name="climb as seen",
@@ -364,7 +356,7 @@ SEEING_STAGES = (
         mixture=CROSSING,
         terrain=OBSTACLES,
         rewards=EXACT,
-        randomization=replace(GENTLE, hand_load_probability=0.4),
+        randomization=LOADED,
         harder=HARD,
     ),
     Stage(
