@@ -26,6 +26,9 @@ MARGIN = 0.5
 """Flat ground around what stands on a tile [m]."""
 LANDING = 2.0
 """Side of the flat top of slopes and stairs [m]."""
+DEPTH = 0.5
+"""How far blocks reach below the ground plane [m]: out of a thin one a foot that has sunk past its middle is pushed
+downwards, and stays caught in it."""
 STANCE_REACH = 0.3
 """No part of a standing robot's soles is farther than this from the base, horizontally and along each axis [m]."""
 
@@ -220,13 +223,14 @@ class Terrain:
         for number, block in enumerate(self.blocks):
             geom = spec.worldbody.add_geom(name=f"terrain_{number}")
             if block.half_top is None:
-                half_height = 0.5 * block.top
                 geom.type = mujoco.mjtGeom.mjGEOM_BOX
-                geom.pos, geom.size = [*block.center, half_height], [*block.half_extent, half_height]
+                geom.pos = [*block.center, 0.5 * (block.top - DEPTH)]
+                geom.size = [*block.half_extent, 0.5 * (block.top + DEPTH)]
             else:
+                base = block.half_extent
                 corners = [
                     (sign_x * x, sign_y * y, z)
-                    for (x, y), z in ((block.half_extent, 0.0), (block.half_top, block.top))
+                    for (x, y), z in ((base, -DEPTH), (base, 0.0), (block.half_top, block.top))
                     for sign_x, sign_y in itertools.product((-1, 1), repeat=2)
                 ]
                 spec.add_mesh(name=f"terrain_{number}", uservert=np.array(corners).flatten())

@@ -60,3 +60,22 @@ def test_feet_do_not_trip_over_the_borders_of_a_level_floor(toe: float) -> None:
         return data.qpos[:7] - np.array([0.0, 0.0, level, 0.0, 0.0, 0.0, 0.0])
 
     np.testing.assert_allclose(land(slabs=True), land(slabs=False), atol=2e-3)
+
+
+@pytest.mark.parametrize("tile", ["slabs", "rough"])
+def test_ground_pushes_a_foot_up_that_has_sunk_into_it(tile: str) -> None:
+    """Out of thin blocks a foot was pushed downwards, and stayed caught in them."""
+    spec = build_spec(ModelOptions())
+    terrain = Terrain(TerrainConfig(tiles=(tile,), levels=(0.0,)))
+    terrain.add_to(spec)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    data.qpos[2] += terrain.blocks[0].top - 0.022 - data.site("left_foot").xpos[2]
+    mujoco.mj_forward(model, data)
+    directions = [
+        contact.frame[2] if "foot" in model.geom(contact.geom2).name else -contact.frame[2]
+        for contact in data.contact
+        if "foot" in model.geom(contact.geom1).name + model.geom(contact.geom2).name
+    ]
+    assert len(directions) >= 16 and min(directions) > 0.99
