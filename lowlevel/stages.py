@@ -42,6 +42,9 @@ class Stage(TaskConfig):
     normalizes_by_kind: bool = True
     """Whether advantages are normalized within each kind of command: for kinds that are learned beside some that are
     mastered already. As long as most robots fall when they walk, that is what is to be learned."""
+    advantage_limit: float = 2.0
+    """Normalized advantages are clipped to +- this: half a percent of the samples, of robots that fall, would else
+    outweigh all others, as they should where falls are what is to be unlearned."""
     rollout_doublings: int = 0
     """Rollouts are 2 to this power times as long as at first: the better the policy, the more samples it takes to see
     what would improve it."""

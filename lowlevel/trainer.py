@@ -139,9 +139,14 @@ class Trainer:
         self.environment = PilotEnvironment(self.config.environment, stage, seed, correction=self._correction)
         self._correction = self.environment.correction
         self._shares, self._tile_shares = shares(stage.mixture), tile_shares(stage.terrain)
-        acting = NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop
         self.ppo.enter(
-            stage.std, acting, stage.rollout_doublings, stage.gait_noise, stage.normalizes_by_kind, stage.noise_at_rest
+            stage.std,
+            acting=NUM_JOINTS if stage.arms_act else LOWER_JOINTS.stop,
+            rollout_doublings=stage.rollout_doublings,
+            gait_noise_share=stage.gait_noise,
+            normalizes_by_task=stage.normalizes_by_kind,
+            noise_at_rest=stage.noise_at_rest,
+            advantage_limit=stage.advantage_limit,
         )
         self._apply_curriculum()
         self.observation = {}

@@ -51,9 +51,6 @@ class PPOConfig:
     """Discount per control step."""
     lam: float = 0.95
     """Decay of the generalized advantage estimate."""
-    advantage_limit: float = 2.0
-    """Normalized advantages are clipped to +- this: half a percent of the samples, of robots that fall, would else
-    outweigh all others."""
     clip: float = 0.2
     """Clipping range of the probability ratio."""
     desired_kl: float = 0.01

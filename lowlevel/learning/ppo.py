@@ -94,7 +94,7 @@ class PPO:
         self._shapes = shapes
         self.gait_clock = gait_clock
         self.tasks = tasks
-        self.gait_noise_share, self.normalizes_by_task = 0.0, False
+        self.gait_noise_share, self.normalizes_by_task, self.advantage_limit = 0.0, False, math.inf
         self._gait_noise = torch.zeros(num_envs, sizes.action, 3, device=self.device)
         """Constant, sine and cosine part of each robot's pattern."""
         self.storage = self._room_for(config.steps_per_update, num_envs)
@@ -177,13 +177,14 @@ class PPO:
         gait_noise_share: float = 0.0,
         normalizes_by_task: bool = False,
         noise_at_rest: float = 1.0,
+        advantage_limit: float = math.inf,
     ) -> None:
         """Go on with exploration noise between the bounds ``std``, in the first ``acting`` actions only.
 
         ``noise_at_rest``: noise of robots whose gait clock rests, as a share of that of those that walk.
         Rollouts are 2 to the power of ``rollout_doublings`` times as long as at first. ``gait_noise_share``: share of
         the noise's variance that repeats with the gait. ``normalizes_by_task``: whether advantages are normalized
-        within each task.
+        within each task. ``advantage_limit``: normalized advantages are clipped to +- this.
 
         Raises:
             ValueError: in the middle of a rollout.
@@ -196,6 +197,7 @@ class PPO:
         self.learner.acting = slice(0, acting)
         self.learner.std_bounds, self.learner.noise_at_rest = std, noise_at_rest
         self.gait_noise_share, self.normalizes_by_task = gait_noise_share, normalizes_by_task
+        self.advantage_limit = advantage_limit
         self.learner.limit_noise()
 
     @torch.no_grad()
@@ -288,10 +290,9 @@ class PPO:
         )
         storage.data["returns"].copy_(advantages + values)
         explained = 1.0 - float(advantages.var() / storage.data["returns"].var().clamp(min=1e-8))
-        limit = self.config.advantage_limit
         task = storage.task if self.normalizes_by_task else torch.zeros_like(storage.task)
         normalized = normalized_by_task(advantages, task, self.tasks)
-        storage.data["advantage"].copy_(normalized.clamp(-limit, limit))
+        storage.data["advantage"].copy_(normalized.clamp(-self.advantage_limit, self.advantage_limit))
         return explained
 
     def _update_normalizers(self) -> None:

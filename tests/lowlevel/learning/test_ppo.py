@@ -188,7 +188,8 @@ def test_timeouts_are_bootstrapped_with_the_state_before_the_reset() -> None:
 
 
 def test_no_sample_outweighs_the_others() -> None:
-    ppo = make_ppo(robots=64, steps_per_update=1, minibatches=1, advantage_limit=1.5, gamma=0.0)
+    ppo = make_ppo(robots=64, steps_per_update=1, minibatches=1, gamma=0.0)
+    ppo.enter((0.05, 1.0), acting=4, advantage_limit=1.5)
     ppo.act(observation(torch.Generator().manual_seed(0), 64))
     reward = torch.zeros(64)
     reward[0], reward[1:4] = -100.0, 100.0
