@@ -275,5 +275,5 @@ def test_the_shipped_learning_state_can_be_continued() -> None:
     trainer = Trainer(small, run)
     trainer.load()
     trainer.observation = trainer.environment.reset()
-    assert trainer.steps > 1_000_000 and trainer.stage.name == "harden"
+    assert trainer.steps > 1_000_000 and trainer.stage.name == "refine"
     trainer.iterate()
