@@ -35,7 +35,8 @@ class Stage(TaskConfig):
     """Noise of a robot whose gait clock rests, as a share of that of one that walks. Noise at which a robot learns to
     walk fells one that bends deeply, and it learns to bend less."""
     calibrates: bool = False
-    """Whether the stage begins with a calibration of the told velocity (:mod:`lowlevel.imitation.calibration`)."""
+    """Whether the stage begins with a calibration of the told velocity and of the balance under loads
+    (:mod:`lowlevel.imitation.calibration`)."""
     gait_noise: float = 0.8
     """Share of the exploration noise's variance that is a pattern over the gait clock, and constant at a stand: for a
     robot that improves its gait. One that learns to balance does it in white noise."""

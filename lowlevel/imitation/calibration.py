@@ -4,7 +4,7 @@ A trained policy walks at a velocity of its own for every command, the same when
 lasting errors in two tries agree to 0.015 m/s, of 0.12 m/s. So it does not lack a reaction; it has a wrong answer to
 the command, which 135 million steps of PPO had not mended. The error is measured for some ten thousand commands, and
 what takes it away is fitted as a function of the command (iterative learning control; Bristow et al., IEEE Control
-Systems 26(3), 2006). The torso's lasting pitch, which depends on what the robot carries, is cloned away.
+Systems 26(3), 2006). The lasting lean of torso and robot, which depends on what it carries, is cloned away.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def calibrate(
     cloning: CloningConfig,
     report: Callable[[str], None],
 ) -> dict[str, Tensor]:
-    """Correct the velocity that the policy of ``ppo`` is told, and clone a torso that is pitched as commanded into it.
+    """Correct the velocity that the policy of ``ppo`` is told, and clone into it what holds it upright under loads.
 
     ``report`` is told how it goes. Returns the observation to go on from.
     """
