@@ -67,7 +67,8 @@ class UprightTeacher:
         errors = torch.stack([torso_error(measured, buffers.command)[:, 1], measured.capture_point[:, 0]], dim=1)
         # A robot that was pushed catches itself, and knows how to.
         balances = rests & (measured.capture_point.norm(dim=1) < FARTHEST)
-        works = torch.stack([self._settled > config.settling, (self._settled > config.settling) & balances], dim=1)
+        settled = self._settled > config.settling
+        works = torch.stack([settled, settled & balances], dim=1)
         change = period * (self._rates * errors - config.leak * self._added) * works
         self._added = (self._added + change).clamp(-config.limit, config.limit)
         self._added[:, 1] *= rests
