@@ -1,7 +1,7 @@
 """A teacher that also holds the robot up: what slow integrators at waist and ankles would add to another one's action.
 
-Under a load before the chest a trained robot leans forwards, with its capture point up to 0.1 m ahead, although 0.04
-rad at the waist and 0.08 rad at the ankles bring torso and capture point back. That takes seconds to show, and PPO
+Under a load before the chest a trained robot leans forwards, with its capture point up to 0.1 m ahead, although at
+most 0.05 rad at the waist and 0.1 rad at the ankles bring both back. That takes seconds to show, and PPO
 credits an action with what follows within half a second.
 """
 
