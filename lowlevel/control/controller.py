@@ -47,7 +47,7 @@ from robots.errors import PilotError
 from robots.g1.constants import JOINT_NAMES, NUM_JOINTS, Gains
 from robots.g1.nominal_pose import Axis, NominalPose
 
-FORMAT_VERSION = 9
+FORMAT_VERSION = 10
 CONFIG_FILE, WEIGHTS_FILE, ONNX_FILE, GOLDEN_FILE = (
     "controller.json",
     "weights.safetensors",
@@ -341,14 +341,10 @@ def build_step(
 
 
 def _read_policy(folder: Path, config: ControllerConfig, device: torch.device | str) -> ControlStep:
-    path = folder / CONFIG_FILE
-    stored = _FOLDER.read_description(folder).get("policy")
-    if stored is None:
-        raise ControllerError(f"{path} describes no policy for torch: use the runtime 'onnx'")
     try:
-        policy = from_plain(PolicyConfig, stored)
+        policy = from_plain(PolicyConfig, _FOLDER.read_description(folder)["policy"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ControllerError(f"{path} is incomplete: {error}") from error
+        raise ControllerError(f"{folder / CONFIG_FILE} is incomplete: {error}") from error
     tensors = _FOLDER.read_weights(folder)
     try:
         pose_tensors = [tensors.pop(f"nominal_pose.{name}").to(device) for name in _POSE_TENSORS]

@@ -41,15 +41,15 @@ class ExpertConfig:
     """[s]"""
     clearance: float = 0.07
     """Of each palm from its face before the grasp [m]."""
-    palm_ahead: float = 0.0
-    """Of the palms from the middle of the side faces [m]."""
+    palm_ahead: float = 0.025
+    """Of the palms' targets from the middle of the side faces [m]: the arms end up short of them by as much."""
     finger_pitch: float = 0.85
     """Fingers point down by this much [rad]."""
     toe_in: float = 0.12
     """Fingers point at each other by this much, so that forearms stay clear of the faces [rad]."""
-    toe_in_per_depth: float = 2.5
+    toe_in_per_depth: float = 3.5
     """More of it per squeeze depth [rad/m]: the wrists give way, and the palms must not open."""
-    level_gain: float = 0.05
+    level_gain: float = 0.03
     """Share of the box's pitch that the fingers take back at every decision while it is carried."""
     largest_level: float = 0.6
     """[rad]"""
@@ -59,17 +59,17 @@ class ExpertConfig:
     """Largest distance of a palm from its shoulder while the body descends [m]."""
     ready_tolerance: float = 0.06
     """Of the palms from their pre-grasp places before they close [m]."""
-    close_speed: float = 0.16
+    close_speed: float = 0.12
     """Of each palm towards its face [m/s]."""
-    force: float = 36.0
+    force: float = 30.0
     """Wanted normal force per palm [N]."""
     force_gain: float = 0.0016
     """Squeeze depth per force error and decision [m/N]."""
     deepest: float = 0.095
     """Largest squeeze depth [m]."""
-    grasp_time: float = 0.3
+    grasp_time: float = 0.5
     """Time with both palms loaded before the lift [s]."""
-    lift_time: float = 2.2
+    lift_time: float = 3.2
     """[s]"""
     carry_ahead: float = 0.34
     """Of the palms from the feet when upright [m]."""
