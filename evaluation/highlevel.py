@@ -12,6 +12,7 @@ from typing import Any, get_args, get_type_hints
 import torch
 import tyro
 
+from evaluation.protocols.conditions import CONDITIONS, condition_of
 from evaluation.protocols.parallel import Run, Setting, run_all
 from evaluation.protocols.policies import SCRIPTED, controller_for
 from evaluation.protocols.sweeps import SweepResult, cells, sweep_figures, sweep_result, write_plots
@@ -37,8 +38,9 @@ from lowlevel.control.controller import content_hash
 from lowlevel.runs.command_line import command_line
 from lowlevel.runs.processes import available_cores
 from lowlevel.runs.progress import ProgressReport
+from lowlevel.world.randomization import RandomizationConfig
 from robots.errors import PilotError
-from robots.g1.model import describe_foreign
+from robots.g1.model import ModelOptions, describe_foreign
 
 EPISODES_FILE = "episodes.json"
 LIFT_STAGE = "lift"
@@ -61,6 +63,9 @@ class Arguments:
     """Controller folder; by default the shipped one of the planner, and pilot-g1-simple for the expert."""
     robot: Path | None = None
     """MJCF of another model of the G1 to run on (docs/compare.md)."""
+    condition: str = "nominal"
+    """What the robot is like, a name of :data:`evaluation.protocols.conditions.CONDITIONS`: weak-waist (35 N m),
+    late-40ms (targets), slippery (friction 0.4), other-gains (each off by up to 20 %) and so on."""
     episodes: int = 500
     """Episodes; episode i of a seed is the same for every planner."""
     seed: int = 0
@@ -113,7 +118,8 @@ def _run(arguments: Arguments) -> None:
     check_output(arguments.output)
     folder = controller_for(arguments.planner, arguments.controller)
     torch.set_num_threads(1)
-    print(f"evaluating {arguments.planner} on {task.name}", flush=True)
+    robot_ranges(arguments.condition)
+    print(f"evaluating {arguments.planner} on {task.name}, condition {arguments.condition}", flush=True)
     if arguments.robot is not None:
         print(describe_foreign(arguments.robot))
     evaluation = evaluate(arguments, folder)
@@ -140,7 +146,14 @@ def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
             for variant in grid
         ),
     ]
-    setting = Setting(arguments.planner, controller, arguments.seed, arguments.robots, arguments.robot)
+    setting = Setting(
+        arguments.planner,
+        controller,
+        arguments.seed,
+        arguments.robots,
+        arguments.robot,
+        robot_ranges(arguments.condition),
+    )
     with ProgressReport() as progress:
         bar = progress.add_task("episodes", total=sum(run.count for run in runs))
         results = run_all(
@@ -164,6 +177,22 @@ def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
         sweeps=swept,
         seconds=time.monotonic() - began,
     )
+
+
+def robot_ranges(condition: str) -> RandomizationConfig | None:
+    """What the robots are like under a ``condition``; None for the model's own.
+
+    Raises:
+        PilotError: if it is unknown or changes more than the robot's feet and motors.
+    """
+    chosen = condition_of(condition)
+    if chosen == CONDITIONS["nominal"]:
+        return None
+    if chosen.push_speed > 0.0 or chosen.options != ModelOptions():
+        raise PilotError(
+            f"the condition {condition} is for evaluate-lowlevel alone: it changes more than feet and motors"
+        )
+    return chosen.randomization
 
 
 def control_names(task: Task) -> tuple[str, ...]:
@@ -246,6 +275,7 @@ def write_report(folder: Path, evaluation: Evaluation) -> None:
         evaluation.controller,
         evaluation.planner or SCRIPTED,
         task=arguments.task,
+        condition=arguments.condition,
         seconds=round(evaluation.seconds, 1),
     )
     write_metrics(folder, content)
@@ -285,6 +315,7 @@ def report_text(evaluation: Evaluation, figures: dict[str, Figure]) -> str:
         controller=evaluation.controller,
         count=len(evaluation.records),
         robot=evaluation.arguments.robot,
+        condition=evaluation.arguments.condition,
         headline=HEADLINE,
         stages=evaluation.stages,
         figures=figures,

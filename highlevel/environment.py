@@ -22,8 +22,10 @@ from highlevel.task import Decision, ObservationBlock, Task, rows
 from lowlevel.commands import COMMAND_SIZE
 from lowlevel.control.controller import Controller
 from lowlevel.runs.checks import require_finite
+from lowlevel.runs.draws import uniform
 from lowlevel.runs.precision import single_precision
 from lowlevel.world.measures import Measurement
+from lowlevel.world.randomization import RandomizationConfig, Randomizer
 from lowlevel.world.terrain import TerrainConfig
 from lowlevel.world.world import World
 from robots.errors import PilotError
@@ -39,6 +41,9 @@ ROBOT_BLOCKS = (
 )
 """The robot's part of the paper's planner observation: joint positions relative to the default pose, and the
 limited command in units of the action."""
+
+_ROBOT_STREAM = 2**20
+"""Of the random numbers of an episode; tasks count theirs from zero."""
 
 
 ControlObserver = Callable[[Measurement, Decision], None]
@@ -104,6 +109,8 @@ class CommandEnvironment:
         num_envs: robots side by side.
         seed: seed of the episodes; robot i runs episodes i, i + N, i + 2 N, ...
         physics: accuracy and threads.
+        robots: feet, motors and latency, drawn anew for every episode; the model's own by default. Loads, pushes and
+            errors of sensors have no part in it.
 
     Raises:
         PilotError: if another environment has the task.
@@ -117,6 +124,7 @@ class CommandEnvironment:
         num_envs: int = 1,
         seed: int = 0,
         physics: PhysicsConfig | None = None,
+        robots: RandomizationConfig | None = None,
     ) -> None:
         if task.is_taken:
             raise PilotError(f"this task {task.name!r} belongs to another environment already: make a task for each")
@@ -143,6 +151,7 @@ class CommandEnvironment:
         self.blocks = (*task.object_blocks, *ROBOT_BLOCKS, *task.added_blocks)
         self.observation_size = sum(block.size for block in self.blocks)
         task.attach(self.simulation)
+        self._randomizer = None if robots is None else Randomizer(robots, self.simulation, torch.Generator())
 
         self._default = torch.tensor(DEFAULT_POSITION, dtype=torch.float32)
         self._flag = torch.ones(num_envs, 1)
@@ -181,12 +190,24 @@ class CommandEnvironment:
         neutral = self.controller.command_space.neutral().repeat(len(ids), 1)
         self.simulation.restart(ids)
         start = self.task.reset(ids, self.seed, self.episode[ids])
-        self.world.stand(ids, start.position, start.heading, neutral)
+        self._draw(ids)
+        joints = self.world.stand(ids, start.position, start.heading, neutral)
+        if self._randomizer is not None:
+            self._randomizer.start(ids, joints)
         self.controller.reset(self.num_envs, ids)
         self.command = self.command.clone()
         self.command[ids] = neutral
         self.decisions[ids] = 0
         self.measured = self.world.measure()
+
+    def _draw(self, ids: Tensor) -> None:
+        """Draw what robots ``ids`` (n,) are like in their episodes."""
+        if self._randomizer is None:
+            return
+        seeds = 2**24 * uniform(self.seed, self.episode[ids], _ROBOT_STREAM, 1)
+        for robot, seed in zip(ids.split(1), seeds[:, 0].tolist(), strict=True):
+            self._randomizer.generator.manual_seed(int(seed))
+            self._randomizer.draw(robot)
 
     # -- stepping --------------------------------------------------------------------------------------------
 
@@ -232,7 +253,8 @@ class CommandEnvironment:
         for number in range(1, steps + 1):
             command = interpolate(previous, goal, number / steps)
             targets = self.controller.act(self.measured.proprioception, elevation, command, self._flag)
-            self.measured = self.world.advance(targets)
+            arriving = targets if self._randomizer is None else self._randomizer.delayed(targets)
+            self.measured = self.world.advance(arriving)
             falls = self.world.fallen(self.measured)
             outcome = self.task.step(self.measured, decision)
             for observe in observers:

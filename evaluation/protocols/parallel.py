@@ -16,6 +16,7 @@ from evaluation.protocols.policies import make_policy
 from highlevel.environment import CommandEnvironment, PhysicsConfig
 from highlevel.episodes import EpisodeRecord, run_episodes
 from highlevel.task import Task
+from lowlevel.world.randomization import RandomizationConfig
 from robots.errors import PilotError
 
 
@@ -40,6 +41,8 @@ class Setting:
     """Robots side by side in a run."""
     mjcf: Path | None = None
     """Somebody else's MJCF of the robot."""
+    robot_ranges: RandomizationConfig | None = None
+    """What the robots are like, if not as the model has them."""
 
 
 def run_all(
@@ -94,7 +97,9 @@ def _run(
     run: Run, setting: Setting, threads: int, on_progress: Callable[[int], None] | None = None
 ) -> list[EpisodeRecord]:
     physics = PhysicsConfig(num_threads=threads, mjcf=setting.mjcf)
-    environment = CommandEnvironment(run.task, setting.controller, setting.robots, physics=physics)
+    environment = CommandEnvironment(
+        run.task, setting.controller, setting.robots, physics=physics, robots=setting.robot_ranges
+    )
     policy = make_policy(setting.planner, environment, setting.controller)
     return run_episodes(environment, policy, run.count, setting.seed, on_progress=on_progress)
 

@@ -128,6 +128,8 @@ def test_command_writes_a_report(
         (["--planner", "scripted", "--task", "fly"], "there is no task 'fly'"),
         (["--planner", "{tmp}/nowhere"], "planner.json is missing"),
         (["--planner", "scripted", "--episodes", "0"], "--episodes must be at least 1"),
+        (["--planner", "scripted", "--condition", "windy"], "unknown condition 'windy'"),
+        (["--planner", "scripted", "--condition", "heavy-torso"], "heavy-torso is for evaluate-lowlevel alone"),
         (["--planner", "scripted", "--controller", "{tmp}"], "controller.json is missing"),
     ],
 )

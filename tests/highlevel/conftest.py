@@ -12,6 +12,7 @@ from highlevel.environment import ROBOT_BLOCKS, CommandEnvironment, PhysicsConfi
 from highlevel.learning.config import PPOConfig
 from highlevel.learning.demonstrations import Source
 from highlevel.registry import load_task
+from lowlevel.world.randomization import RandomizationConfig
 
 
 @pytest.fixture
@@ -32,7 +33,8 @@ def source() -> Source:
 def make_environment(untrained_controller: Path, coarse_physics: PhysicsConfig) -> Callable[..., CommandEnvironment]:
     torch.set_num_threads(1)
 
-    def make(num_envs: int = 2, seed: int = 0) -> CommandEnvironment:
-        return CommandEnvironment(load_task("lift_box"), untrained_controller, num_envs, seed, coarse_physics)
+    def make(num_envs: int = 2, seed: int = 0, robots: RandomizationConfig | None = None) -> CommandEnvironment:
+        task = load_task("lift_box")
+        return CommandEnvironment(task, untrained_controller, num_envs, seed, coarse_physics, robots)
 
     return make
