@@ -118,7 +118,7 @@ def _run(arguments: Arguments) -> None:
     check_output(arguments.output)
     folder = controller_for(arguments.planner, arguments.controller)
     torch.set_num_threads(1)
-    robot_ranges(arguments.condition)
+    randomization_of(arguments.condition)
     print(f"evaluating {arguments.planner} on {task.name}, condition {arguments.condition}", flush=True)
     if arguments.robot is not None:
         print(describe_foreign(arguments.robot))
@@ -152,7 +152,7 @@ def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
         arguments.seed,
         arguments.robots,
         arguments.robot,
-        robot_ranges(arguments.condition),
+        randomization_of(arguments.condition),
     )
     with ProgressReport() as progress:
         bar = progress.add_task("episodes", total=sum(run.count for run in runs))
@@ -179,8 +179,8 @@ def evaluate(arguments: Arguments, controller: Path) -> Evaluation:
     )
 
 
-def robot_ranges(condition: str) -> RandomizationConfig | None:
-    """What the robots are like under a ``condition``; None for the model's own.
+def randomization_of(condition: str) -> RandomizationConfig | None:
+    """Of the robots under a ``condition``; None for what the model has.
 
     Raises:
         PilotError: if it is unknown or changes more than the robot's feet and motors.

@@ -109,8 +109,8 @@ class CommandEnvironment:
         num_envs: robots side by side.
         seed: seed of the episodes; robot i runs episodes i, i + N, i + 2 N, ...
         physics: accuracy and threads.
-        robots: feet, motors and latency, drawn anew for every episode; the model's own by default. Loads, pushes and
-            errors of sensors have no part in it.
+        randomization: feet, motors and latency, drawn anew for every episode; the model's own by default. Loads,
+            pushes and errors of sensors have no part in it.
 
     Raises:
         PilotError: if another environment has the task.
@@ -124,7 +124,7 @@ class CommandEnvironment:
         num_envs: int = 1,
         seed: int = 0,
         physics: PhysicsConfig | None = None,
-        robots: RandomizationConfig | None = None,
+        randomization: RandomizationConfig | None = None,
     ) -> None:
         if task.is_taken:
             raise PilotError(f"this task {task.name!r} belongs to another environment already: make a task for each")
@@ -151,7 +151,9 @@ class CommandEnvironment:
         self.blocks = (*task.object_blocks, *ROBOT_BLOCKS, *task.added_blocks)
         self.observation_size = sum(block.size for block in self.blocks)
         task.attach(self.simulation)
-        self._randomizer = None if robots is None else Randomizer(robots, self.simulation, torch.Generator())
+        self._randomizer: Randomizer | None = None
+        if randomization is not None:
+            self._randomizer = Randomizer(randomization, self.simulation, torch.Generator())
 
         self._default = torch.tensor(DEFAULT_POSITION, dtype=torch.float32)
         self._flag = torch.ones(num_envs, 1)

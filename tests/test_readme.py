@@ -68,6 +68,15 @@ def test_success_rates_are_those_of_the_reports(report: str) -> None:
     assert f"| {' | '.join(shares)} | {time:.1f} s |" in README
 
 
+@pytest.mark.parametrize(
+    "condition", ["slippery", "late-20ms", "late-40ms", "other-gains", "weak-motors", "weak-waist"]
+)
+def test_success_under_a_condition_is_that_of_its_report(condition: str) -> None:
+    content = json.loads((ROOT / "docs" / "reports" / f"lift-box-{condition}" / "metrics.json").read_text())
+    assert content["condition"] == condition
+    assert f"| {_share(content['figures']['full'])} |" in README
+
+
 def test_tracking_figures_are_those_of_the_report() -> None:
     figures = json.loads((ROOT / "docs" / "reports" / "lowlevel-simple" / "metrics.json").read_text())["figures"]
     for name, digits in (("E_v", 3), ("E_omega", 3), ("E_h", 4), ("E_arm", 3)):

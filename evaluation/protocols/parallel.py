@@ -41,8 +41,8 @@ class Setting:
     """Robots side by side in a run."""
     mjcf: Path | None = None
     """Somebody else's MJCF of the robot."""
-    robot_ranges: RandomizationConfig | None = None
-    """What the robots are like, if not as the model has them."""
+    randomization: RandomizationConfig | None = None
+    """Of the robots; None for what the model has."""
 
 
 def run_all(
@@ -98,7 +98,7 @@ def _run(
 ) -> list[EpisodeRecord]:
     physics = PhysicsConfig(num_threads=threads, mjcf=setting.mjcf)
     environment = CommandEnvironment(
-        run.task, setting.controller, setting.robots, physics=physics, robots=setting.robot_ranges
+        run.task, setting.controller, setting.robots, physics=physics, randomization=setting.randomization
     )
     policy = make_policy(setting.planner, environment, setting.controller)
     return run_episodes(environment, policy, run.count, setting.seed, on_progress=on_progress)

@@ -33,8 +33,8 @@ def source() -> Source:
 def make_environment(untrained_controller: Path, coarse_physics: PhysicsConfig) -> Callable[..., CommandEnvironment]:
     torch.set_num_threads(1)
 
-    def make(num_envs: int = 2, seed: int = 0, robots: RandomizationConfig | None = None) -> CommandEnvironment:
+    def make(num_envs: int = 2, seed: int = 0, randomization: RandomizationConfig | None = None) -> CommandEnvironment:
         task = load_task("lift_box")
-        return CommandEnvironment(task, untrained_controller, num_envs, seed, coarse_physics, robots)
+        return CommandEnvironment(task, untrained_controller, num_envs, seed, coarse_physics, randomization)
 
     return make

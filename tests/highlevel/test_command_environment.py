@@ -91,24 +91,21 @@ def test_environments_that_are_given_one_controller_do_not_disturb_each_other(
 
 def test_late_targets_arrive_late_and_an_episodes_robot_is_the_same_in_any_row(make_environment: Make) -> None:
     drawn = replace(RandomizationConfig.for_evaluation(), delay=(0.0, 0.0, 1.0), waist_effort=(35.0, 50.0))
-    late, prompt = make_environment(3, robots=drawn), make_environment(3)
+    late = make_environment(3, randomization=drawn)
     sent: list[Tensor] = []
     advance = late.world.advance
     late.world.advance = lambda targets: sent.append(targets) or advance(targets)  # type: ignore[assignment, func-returns-value]
     late.reset(seed=1)
-    prompt.reset(seed=1)
     start = late.simulation.read().joint_position.clone()
     waist = [late.simulation.model.actuator(f"waist_{axis}_joint").id for axis in ("roll", "pitch")]
     limits = late.simulation.per_robot("actuator_forcerange")[:, waist, 1].copy()
     assert (limits > 35.0).all() and (limits < 50.0).all() and len(set(limits.flatten().tolist())) == 6
-    action = _actions(1, 3)[0]
-    late.step(action)
-    prompt.step(action)
+    late.step(_actions(1, 3)[0])
     torch.testing.assert_close(sent[0], start, rtol=0, atol=1e-5)
     torch.testing.assert_close(sent[1], start, rtol=0, atol=1e-5)
     assert not torch.allclose(sent[2], start, atol=1e-3)
 
-    other = make_environment(2, robots=drawn)
+    other = make_environment(2, randomization=drawn)
     other.seed, other.episode = 1, torch.tensor([2, 0])
     other._begin(torch.arange(2))
     swapped = other.simulation.per_robot("actuator_forcerange")[:, waist, 1]
